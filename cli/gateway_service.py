@@ -17,8 +17,7 @@ from daedalus.cli.run_source import LearnerSource
 from daedalus.gateway.app import application
 from daedalus.gateway.config import GatewayConfig
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
-from daedalus.gateway.raw.endpoint import RawEndpoint
+from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import OperatorToken, Tokens
@@ -55,6 +54,7 @@ class GatewaySettings:
     hosts: list[str] = field(default_factory=list)  # further names of this gateway
     origins: list[str] = field(default_factory=list)  # of pages that may connect
     operator_token: OperatorToken | None = None
+    takes_clients: bool = True  # or the page only
     other_runs: Callable[[], list[OtherRun]] = lambda: []
     camera: tuple[str, ...] | None = None  # command of the camera's process; None: no camera
     announce: Callable[[str], None] | None = None  # receives the address of the page, instead of the log
@@ -71,7 +71,7 @@ class GatewayService:
         self._gateway: asyncio.Future[Gateway] = self._loop.create_future()
         self._monitor: RunMonitor | None = None
         self._camera = None if settings.camera is None else CameraProcess(settings.camera)
-        self._data = PageData(settings.other_runs, self._camera)
+        self._data = PageData(settings.other_runs, self._camera, takes_clients=settings.takes_clients)
         self._transports = ExitStack()
         owner = settings.credentials.name if settings.credentials else ""
         name = f"{owner or 'gateway'}.gateway-{os.getpid()}"
@@ -86,22 +86,20 @@ class GatewayService:
         tls = None if settings.serving is None else tls_context(settings.serving.directory)
         certified = [] if settings.serving is None else _bracketed(settings.serving.hosts())
         names = [*LOOPBACK, *settings.hosts, *certified, socket.gethostname()]
-        rules = guard(names, port, settings.origins, tokens, settings.operator_token)
-        raw = RawEndpoint(self._raw_transport, rules, self._config.actor_name)
+        # Whoever reaches a plain TCP address may ask its learner for the status: the page may show it to everybody.
+        openly = settings.operator is None and all(address.startswith("tcp/") for address in settings.connect)
+        rules = guard(names, port, settings.origins, tokens, settings.operator_token, reads_openly=openly)
         where, secure = f"{settings.shown_host}:{port}", "s" if tls else ""
-        _logger.info("clients connect to ws%s://%s/actor", secure, where)
+        if settings.takes_clients:
+            _logger.info("clients connect to ws%s://%s/actor", secure, where)
         if settings.announce is None:
             _logger.info("the page of the run is at http%s://%s/", secure, where)
         else:
             settings.announce(f"http{secure}://{where}/")
         tasks = [asyncio.create_task(self._await_stop()), asyncio.create_task(self._reach_network())]
-
-        async def close() -> None:
-            await asyncio.gather(raw.close(), self._close())
-
         try:
-            await Server(application(self._gateway, raw, rules, self._data), tls).run_until(
-                self._ended, listener, close
+            await Server(application(self._gateway, rules, self._data), tls).run_until(
+                self._ended, listener, self._close
             )
         finally:
             for task in tasks:
@@ -109,14 +107,6 @@ class GatewayService:
             await asyncio.to_thread(self._transports.close)
         if self._failures:
             raise self._failures[0]
-
-    def _raw_transport(self) -> Transport:
-        """Return the transport of one raw client. Waits for the network, on the thread of that client."""
-        settings = self._settings
-        transport = connect_with_retry(settings.connect, self._stop, JOIN_SECONDS, settings.credentials)
-        if transport is None:
-            raise TransportError("the gateway stops")
-        return transport
 
     def _fail(self, error: Exception) -> None:
         self._failures.append(error)

@@ -12,32 +12,32 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 
 from daedalus.gateway.assets import Asset, read_assets
 from daedalus.gateway.connection import ClientConnection
-from daedalus.gateway.gateway import Gateway
-from daedalus.gateway.raw.endpoint import RawEndpoint
+from daedalus.gateway.gateway import MAX_CLIENTS, Gateway
+from daedalus.gateway.places import Places, most_connections
 from daedalus.gateway.security import HEADERS, Guard
 from daedalus.gateway.watching.page_data import PageData
 from daedalus.gateway.watching.viewer import ViewerConnection
 
+_NO_CLIENTS = "this gateway serves its page only: start the run with --clients too, or a gateway of its own\n"
+
 Application = Callable[[Any, Any, Any], Awaitable[None]]
 
 
-def application(gateway: "asyncio.Future[Gateway]", raw: RawEndpoint, guard: Guard, data: PageData) -> Application:
+def application(gateway: "asyncio.Future[Gateway]", guard: Guard, data: PageData) -> Application:
     """Return the application: every request passes the guard first.
 
     `gateway` has its result when the network is reached; clients wait for it.
     """
+    places = Places(min(MAX_CLIENTS, most_connections() // 2), "clients")
 
     class Actor:
         """The WebSocket of one client."""
 
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-            await ClientConnection(gateway, guard, scope, receive, send).serve()
-
-    class Raw:
-        """The WebSocket of one client that runs the policy itself."""
-
-        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-            await raw.serve(scope, receive, send)
+            if data.takes_clients:
+                await ClientConnection(gateway, guard, places, scope, receive, send).serve()
+            else:
+                await PlainTextResponse(_NO_CLIENTS, 403)(scope, receive, send)
 
     class Watch:
         """The WebSocket of one page."""
@@ -54,11 +54,10 @@ def application(gateway: "asyncio.Future[Gateway]", raw: RawEndpoint, guard: Gua
         return _response(assets["index.html"])
 
     async def play_page(request: Request) -> Response:
-        return _response(assets["play.html"])
+        return _response(assets["play.html"]) if data.takes_clients else PlainTextResponse(_NO_CLIENTS, 403)
 
     routes: list[BaseRoute] = [
         WebSocketRoute("/actor", Actor()),
-        WebSocketRoute("/raw", Raw()),
         WebSocketRoute("/watch", Watch()),
         Route("/", run_page),
         Route("/play", play_page),

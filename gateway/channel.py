@@ -11,8 +11,13 @@ class Channel(Protocol):
         """Set the largest message, before memory is allocated for it."""
         ...
 
-    def become_stream(self, size: int) -> None:
-        """Set the largest message, and let the client wait for any time."""
+    @property
+    def peer(self) -> str:
+        """Who is at the other end, for those without a token: a user of this machine, or an address."""
+        ...
+
+    def settle(self, settled: bool) -> None:
+        """Note whether the connection has a place. One without gives way to newer connections."""
         ...
 
     def divert(self, on_message: Callable[[str | bytes], None], on_writable: Callable[[], None]) -> None:

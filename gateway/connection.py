@@ -13,6 +13,7 @@ from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.messages import TRANSITIONS, Act, EndEpisode, Hello, Reward, State
+from daedalus.gateway.places import Places
 from daedalus.gateway.rate_limit import RateLimit
 from daedalus.gateway.security import Guard
 
@@ -33,9 +34,11 @@ class ClientConnection:
     would take as long as the answer.
     """
 
-    def __init__(self, gateway: "asyncio.Future[Gateway]", guard: Guard, scope: Any, receive: Any, send: Any) -> None:
+    def __init__(
+        self, gateway: "asyncio.Future[Gateway]", guard: Guard, places: Places, scope: Any, receive: Any, send: Any
+    ) -> None:
         """`gateway` has its result when the network is reached."""
-        self._reached, self._guard, self._scope = gateway, guard, scope
+        self._reached, self._guard, self._places, self._scope = gateway, guard, places, scope
         self._receive_event, self._send_event = receive, send
         self._channel = channel_of(scope)
         self._state: State = "new"
@@ -81,7 +84,12 @@ class ClientConnection:
         self._as_text = text is not None
         hello = messages.read(event["bytes"] if text is None else text, self._state)
         assert isinstance(hello, Hello)
-        self._guard.check_token(hello.name, hello.token)
+        owner = self._guard.check_token(hello.name, hello.token) or self._channel.peer
+        with self._places.take(owner, self.end):
+            self._channel.settle(True)
+            await self._take_part(hello)
+
+    async def _take_part(self, hello: Hello) -> None:
         address = self._address()
         reading = asyncio.create_task(self._read_early())
         try:
@@ -183,6 +191,7 @@ class ClientConnection:
 
     async def _finish(self, reason: ClientError | str) -> None:
         """Say why the connection ends, and close it."""
+        self._channel.settle(False)
         if isinstance(reason, str):
             message, code = messages.run_ended(reason), _OK
         else:

@@ -132,8 +132,6 @@ class Gateway:
             # It may be the same client, whose connection was lost without a word: pings end it soon.
             reason = f"a client named {hello.name!r} is connected: choose another name, or try again in 20 s"
             raise ClientError("unavailable", reason)
-        if len(self._seats) >= MAX_CLIENTS:
-            raise ClientError("unavailable", f"{MAX_CLIENTS} clients are connected already: try again later")
         actor = self._parked.take(name, spaces) or self._new_actor(name, spaces, address)
         seat = self._seats[name] = Seat(actor, on_end, self._joining.presence())
         try:

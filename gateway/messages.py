@@ -72,7 +72,6 @@ _FIELDS: dict[str, tuple[set[str], set[str]]] = {  # required and optional field
     "end_episode": ({"terminated"}, {"observation", "reward"}),
 }
 _to_json = json.JSONEncoder(separators=(",", ":")).encode
-_RAW_FIELDS = {"type", "version", "name", "token"}
 _ALLOWED = {kind: {"type"} | required | optional for kind, (required, optional) in _FIELDS.items()}
 
 
@@ -103,17 +102,6 @@ def read(data: str | bytes, state: State) -> ClientMessage:
             return EndEpisode(terminated, message.get("observation"), _number(message.get("reward", 0.0)))
         case _:
             return _hello(message)
-
-
-def read_raw_hello(text: str) -> tuple[str, str]:
-    """Return name and token of a client that exchanges messages of the wire. Raises ClientError."""
-    message = _decoded(text)
-    if not isinstance(message, dict) or message.get("type") != "hello" or message.keys() - _RAW_FIELDS:
-        raise ClientError(
-            "malformed", 'the first message must be a hello: {"type": "hello", "version": 1, "name": NAME}'
-        )
-    hello = _hello({"version": None, "name": None, "observations": None, "actions": None, **message})
-    return hello.name, hello.token
 
 
 def _hello(message: dict[str, Any]) -> Hello:

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.tokens import OperatorToken, Tokens
+from daedalus.gateway.tokens import OPERATOR, OperatorToken, Tokens
 
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 HEADERS = {
@@ -24,8 +24,9 @@ class Guard:
 
     hosts: frozenset[str]  # in the Host header, with the port: another name may point here to reach this machine
     origins: frozenset[str]  # of pages that may connect, such as `http://127.0.0.1:8080`
-    tokens: Tokens | None  # None: on loopback clients and viewers need no token
-    operator: OperatorToken | None = None  # of a gateway without `tokens`
+    tokens: Tokens | None  # None: on loopback clients need no token
+    operator: OperatorToken | None = None  # of a gateway without `tokens`: pages need it to read, too
+    reads_openly: bool = True  # without any of them: whether pages may read what everybody may ask the learner
 
     def refusal(self, headers: Iterable[tuple[bytes, bytes]]) -> str:
         """Return why a request is refused, or an empty string.
@@ -40,15 +41,21 @@ class Guard:
             return f"pages of {ascii(origin)[:80]} may not connect: allow them with --allow-origin"
         return ""
 
-    def check_token(self, name: str, token: str) -> None:
-        """Raise ClientError if a client needs another token."""
-        if self.tokens is not None:
-            self.tokens.check(name, token)
+    def check_token(self, name: str, token: str) -> str:
+        """Return the owner of a client's token, empty if it needs none. Raises ClientError if it needs another."""
+        return "" if self.tokens is None else self.tokens.check(name, token)
 
-    def check_viewer(self, token: str) -> None:
-        """Raise ClientError if a page needs another token to read."""
+    def check_viewer(self, token: str) -> str:
+        """Return the owner of a page's token, empty if reading needs none. Raises ClientError if it needs another."""
         if self.tokens is not None:
-            self.tokens.check_viewer(token)
+            return self.tokens.check_viewer(token)
+        if self.operator is not None:
+            self.operator.check_operator(token)
+            return OPERATOR
+        if not self.reads_openly:
+            reason = "this gateway shows the run to operators only: start it with --operator-token FILE"
+            raise ClientError("refused", reason)
+        return ""
 
     @property
     def takes_orders(self) -> bool:
@@ -69,6 +76,8 @@ def guard(
     allowed: Iterable[str],
     tokens: Tokens | None,
     operator: OperatorToken | None = None,
+    *,
+    reads_openly: bool = True,
 ) -> Guard:
     """Return the rules of a gateway.
 
@@ -77,11 +86,18 @@ def guard(
       port: where it listens.
       allowed: further origins.
       tokens: of the clients; with them the gateway uses TLS.
-      operator: the token for orders of a gateway without `tokens`.
+      operator: the token for reading and orders of a gateway without `tokens`.
+      reads_openly: see Guard.
     """
     scheme, default = ("https", 443) if tokens is not None else ("http", 80)
     hosts = {f"{name.lower()}:{port}" for name in names}
     if port == default:
         hosts |= {name.lower() for name in names}
     origins = {f"{scheme}://{host}" for host in hosts} | {origin.lower().rstrip("/") for origin in allowed}
-    return Guard(hosts=frozenset(hosts), origins=frozenset(origins), tokens=tokens, operator=operator)
+    return Guard(
+        hosts=frozenset(hosts),
+        origins=frozenset(origins),
+        tokens=tokens,
+        operator=operator,
+        reads_openly=reads_openly,
+    )

@@ -2,33 +2,43 @@
 
 import asyncio
 import contextlib
+import functools
+import itertools
 import logging
 import socket
 import ssl
+import time
+import traceback
 from asyncio.transports import BaseTransport
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from uvicorn.server import ServerState
 from websockets.exceptions import InvalidState
 from websockets.frames import CloseCode, Frame
 from websockets.http11 import Request as HandshakeRequest
 
 from daedalus.gateway.app import Application
 from daedalus.gateway.messages import MAX_HELLO_BYTES
+from daedalus.gateway.places import most_connections, network_of, peer_of
 from daedalus.transport.credentials import CERTIFICATE, KEY
 
+_logger = logging.getLogger(__name__)
+
 _PING_SECONDS = 10.0  # a client that does not answer a ping for as long is disconnected
-_MAX_CONNECTIONS = 2048
 _MAX_NEWCOMERS = 128  # WebSockets that hold a large part of a first message
 _SMALL_HELLO_BYTES = 16 << 10
 _STOP_SECONDS = 2  # for connections to end after a stop
-_KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
 _QUEUED_MESSAGES = 8  # of one client, before reading pauses
 _MAX_FRAGMENTS = 4096  # of one message: the limit on its bytes does not count empty ones
+_ACCEPT_SECONDS = 0.05  # after an error, before the next connection is accepted
+_ACCEPTED_AT_ONCE = 16  # then others run
+_LINE_SECONDS, _LINE_CHARACTERS = 5.0, 300  # between lines about what the libraries log; of one
 _REQUEST_SECONDS = 10.0  # from the connection, or the last answer, to the end of the next answer; and for a handshake
 
 
@@ -49,10 +59,57 @@ class _Newcomers:
         self._waiting.pop(connection, None)
 
 
+class Link:
+    """One connection, from its acceptance to its end."""
+
+    def __init__(self, address: str, end: Callable[[], object]) -> None:
+        """`end` ends it at once."""
+        self.network, self.end = network_of(address), end
+
+
+class Crowd:
+    """All connections. Beyond their number, the oldest without a place ends: of the address that has the most."""
+
+    def __init__(self) -> None:
+        self._settled: set[Link] = set()
+        self._others: dict[str, dict[Link, None]] = {}  # by address, the oldest first
+
+    def add(self, link: Link) -> None:
+        """Add a new connection, or one whose request was answered."""
+        self.remove(link)
+        while len(self._settled) + sum(map(len, self._others.values())) >= most_connections() and self.make_room():
+            pass
+        self._others.setdefault(link.network, {})[link] = None
+
+    def settle(self, link: Link) -> None:
+        """Note that a connection has a place."""
+        self.remove(link)
+        self._settled.add(link)
+
+    def remove(self, link: Link) -> None:
+        """Forget a connection. Idempotent."""
+        self._settled.discard(link)
+        others = self._others.get(link.network, {})
+        others.pop(link, None)
+        if not others:
+            self._others.pop(link.network, None)
+
+    def make_room(self) -> bool:
+        """End a connection; return whether there was one without a place."""
+        largest = max(self._others.values(), key=len, default=None)
+        if largest is None:
+            return False
+        oldest = next(iter(largest))
+        self.remove(oldest)
+        oldest.end()
+        return True
+
+
 class _Config(uvicorn.Config):
     """Settings of one server, and what its connections share."""
 
     newcomers: _Newcomers
+    crowd: Crowd
 
 
 class PromptHttp(H11Protocol):
@@ -60,26 +117,33 @@ class PromptHttp(H11Protocol):
 
     _deadline: asyncio.TimerHandle | None = None  # it keeps the connection, with all that was received
 
+    config: _Config
+
+    def __init__(self, config: _Config, server_state: ServerState, link: Link) -> None:
+        super().__init__(config, server_state, {})
+        self._link = link
+        self.ws_protocol_class = functools.partial(OurWebSocket, link)  # type: ignore[assignment] - it makes one
+
     def connection_made(self, transport: BaseTransport) -> None:
         """End the connection if no request comes."""
         super().connection_made(transport)  # type: ignore[arg-type] - it is a transport that writes
+        self._link.end = self._abort
         self._begin_deadline()
 
     def on_response_complete(self) -> None:
         """End the connection if no further request comes. uvicorn's own deadline ends with the next byte."""
         self._begin_deadline()
+        self.config.crowd.add(self._link)
         super().on_response_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Free the memory of the connection."""
         super().connection_lost(exc)
         self._end_deadline()
+        self.config.crowd.remove(self._link)
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """Let the WebSocket have its own deadlines. uvicorn's limit on connections is for other requests only."""
-        if len(self.connections) > _MAX_CONNECTIONS:
-            self._abort()
-            return
+        """Let the WebSocket have its own deadlines."""
         self._end_deadline()
         super().handle_websocket_upgrade(event)
 
@@ -104,6 +168,15 @@ class OurWebSocket(WebSocketsSansIOProtocol):
 
     config: _Config
 
+    def __init__(self, link: Link, config: _Config, server_state: ServerState, app_state: dict[str, Any]) -> None:
+        super().__init__(config, server_state, app_state)
+        self._link = link
+
+    def connection_made(self, transport: BaseTransport) -> None:
+        """Take the connection over from HTTP."""
+        super().connection_made(transport)
+        self._link.end = self.transport.abort
+
     def data_received(self, data: bytes) -> None:
         """Note how much of the first message has come."""
         if self._is_new:
@@ -117,6 +190,7 @@ class OurWebSocket(WebSocketsSansIOProtocol):
         """Free the memory of the connection."""
         super().connection_lost(exc)
         self.config.newcomers.remove(self)
+        self.config.crowd.remove(self._link)
 
     def handle_connect(self, event: HandshakeRequest) -> None:
         """Give the application the channel."""
@@ -136,27 +210,31 @@ class OurWebSocket(WebSocketsSansIOProtocol):
         """Deliver a message; pause reading only if the application is behind, which costs two system calls."""
         self._is_new = False
         self.config.newcomers.remove(self)
-        if self._on_message is not None and not self.close_sent:
-            self._deliver(self._on_message)
+        if self.close_sent:
+            self.frames = []
+            return
+        if self.curr_msg_data_type == "text":
+            data = b"".join(self.frames)
+            try:
+                self.frames = [data]
+                text = data.decode()
+            except UnicodeDecodeError:
+                self.frames = []
+                self.conn.fail(CloseCode.INVALID_DATA, "a text is not UTF-8")
+                self.handle_parser_exception()
+                return
+            if self._on_message is not None:
+                self.frames = []
+                self._on_message(text)
+                return
+        elif self._on_message is not None:
+            data, self.frames = b"".join(self.frames), []
+            self._on_message(data)
             return
         paused = self.read_paused
         self.read_paused = paused or self.queue.qsize() < _QUEUED_MESSAGES
         super().send_receive_event_to_app()
         self.read_paused = paused or self.queue.qsize() > _QUEUED_MESSAGES
-
-    def _deliver(self, on_message: Callable[[str | bytes], None]) -> None:
-        data = self.frames[0] if len(self.frames) == 1 else b"".join(self.frames)
-        if self.curr_msg_data_type == "bytes":
-            message: str | bytes = data
-        else:
-            try:
-                message = data.decode()
-            except UnicodeDecodeError:
-                self._on_message = None  # uvicorn closes the connection
-                super().send_receive_event_to_app()
-                return
-        self.frames = []
-        on_message(message)
 
     def keepalive_timeout(self) -> None:
         """End the connection of a client that does not answer a ping, although it may not read what was written."""
@@ -173,15 +251,16 @@ class OurWebSocket(WebSocketsSansIOProtocol):
         """See Channel."""
         self.conn.max_message_size = size
 
-    def become_stream(self, size: int) -> None:
-        """See Channel. TCP detects a host that vanished, in place of pings."""
-        self.limit(size)
-        self.stop_keepalive()
-        connection = self.transport.get_extra_info("socket")
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEP_ALIVE:
-            if hasattr(socket, name):
-                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    @property
+    def peer(self) -> str:
+        """See Channel."""
+        local, remote = self.transport.get_extra_info("sockname"), self.transport.get_extra_info("peername")
+        return peer_of(str((remote or [""])[0]), local, remote)
+
+    def settle(self, settled: bool) -> None:
+        """See Channel."""
+        if not self.disconnected:
+            (self.config.crowd.settle if settled else self.config.crowd.add)(self._link)
 
     def divert(self, on_message: Callable[[str | bytes], None], on_writable: Callable[[], None]) -> None:
         """See Channel."""
@@ -230,7 +309,6 @@ class Server(uvicorn.Server):
             ws_per_message_deflate=False,
             ws_ping_interval=_PING_SECONDS,
             ws_ping_timeout=_PING_SECONDS,
-            limit_concurrency=_MAX_CONNECTIONS,
             timeout_graceful_shutdown=_STOP_SECONDS,
             lifespan="off",
             log_config=None,
@@ -238,11 +316,17 @@ class Server(uvicorn.Server):
             server_header=False,
             proxy_headers=False,
         )
-        config.newcomers = _Newcomers()
+        config.newcomers, config.crowd = _Newcomers(), Crowd()
         config.load()
         config.ssl = tls
-        logging.getLogger("uvicorn").setLevel(logging.WARNING)
+        for name in ("uvicorn", "websockets", "asyncio"):
+            logger = logging.getLogger(name)
+            logger.setLevel(logging.WARNING)
+            logger.handlers, logger.propagate = [OneLine()], False
         super().__init__(config)
+        self.config: _Config = config
+        self._accepting: asyncio.Task[None] | None = None
+        self._beginning: set[asyncio.Task[None]] = set()  # connections whose TLS handshake is not complete
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -250,21 +334,50 @@ class Server(uvicorn.Server):
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, as uvicorn's own method does, with a time limit for TLS handshakes: asyncio's is 60 s."""
-        loop, config = asyncio.get_running_loop(), self.config
-        limit = None if config.ssl is None else _REQUEST_SECONDS
+        """Listen, and count each connection from its first moment on: asyncio's server does so after the handshake."""
         await self.lifespan.startup()
-        self.servers = [
-            await loop.create_server(
-                lambda: PromptHttp(config, self.server_state, {}),
-                sock=listener,
-                ssl=config.ssl,
-                ssl_handshake_timeout=limit,
-                backlog=config.backlog,
-            )
-            for listener in sockets or []
-        ]
+        self.servers = []
+        (listener,) = sockets or []
+        self._accepting = asyncio.create_task(self._accept(listener))
         self.started = True
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the connections."""
+        ending = [task for task in (self._accepting, *self._beginning) if task is not None]
+        for task in ending:
+            task.cancel()
+        await asyncio.gather(*ending, return_exceptions=True)
+        await super().shutdown(sockets)
+
+    async def _accept(self, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        listener.setblocking(False)
+        for number in itertools.count():
+            try:
+                connection, address = await loop.sock_accept(listener)
+            except OSError:  # the client has gone, or the system has no descriptor for it
+                self.config.crowd.make_room()
+                await asyncio.sleep(_ACCEPT_SECONDS)
+                continue
+            link = Link(str(address[0]), functools.partial(_shut_down, connection))
+            self.config.crowd.add(link)
+            task = asyncio.create_task(self._begin(connection, link))
+            self._beginning.add(task)
+            task.add_done_callback(self._beginning.discard)
+            if number % _ACCEPTED_AT_ONCE == 0:
+                await asyncio.sleep(0)  # `sock_accept` does not let others run while connections wait
+
+    async def _begin(self, connection: socket.socket, link: Link) -> None:
+        """Perform the TLS handshake, in a limited time: asyncio's is 60 s. HTTP goes on from there."""
+        config, state = self.config, self.server_state
+        limit = None if config.ssl is None else _REQUEST_SECONDS
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: PromptHttp(config, state, link), connection, ssl=config.ssl, ssl_handshake_timeout=limit
+            )
+        except OSError:
+            config.crowd.remove(link)
+            connection.close()
 
     async def run_until(
         self, stop: asyncio.Event, listener: socket.socket, on_stop: Callable[[], Awaitable[None]]
@@ -279,6 +392,37 @@ class Server(uvicorn.Server):
         for connection in list(self.server_state.connections):  # of clients that did not close theirs in time
             connection.transport.abort()
         await asyncio.sleep(0)  # the loop ends them now
+
+
+def _shut_down(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it has ended
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+class OneLine(logging.Handler):
+    """Handler of what the libraries of the server log: one line without a traceback, and few lines in all.
+
+    Most records tell of a client that breaks a protocol, and a client can do so as often as it likes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.next_at, self._left_out = 0.0, 0  # the monotonic time of the next line
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See logging.Handler."""
+        now = time.monotonic()
+        if now < self.next_at:
+            self._left_out += 1
+            return
+        error = record.exc_info[1] if record.exc_info else None
+        at = traceback.extract_tb(error.__traceback__)[-1:] if error else []
+        cause = f": {type(error).__name__}: {error}" if error else ""
+        where = "".join(f" ({Path(frame.filename).name}:{frame.lineno})" for frame in at)
+        more = f" ({self._left_out} records before this one were left out)" if self._left_out else ""
+        text = " ".join(f"{record.getMessage().strip()}{cause}".split())[:_LINE_CHARACTERS]
+        _logger.log(record.levelno, "%s", f"{text}{where}{more}")
+        self.next_at, self._left_out = now + _LINE_SECONDS, 0
 
 
 def tls_context(directory: Path) -> ssl.SSLContext:

@@ -42,21 +42,26 @@ class Tokens:
         self._tokens: dict[str, tuple[str, float]] = {}
         self._read_if_changed()
 
-    def check(self, name: str, token: str) -> None:
-        """Raise ClientError unless the token is that of this client, or of the name before its first dot."""
+    def check(self, name: str, token: str) -> str:
+        """Return the owner of a client's token: the client's name, or what is before its first dot.
+
+        Raises ClientError if the token is another's.
+        """
         self._read()
-        known, expires = self._tokens.get(name) or self._tokens.get(name.partition(".")[0]) or ("", 0.0)
+        owner = name if name in self._tokens else name.partition(".")[0]
+        known, expires = self._tokens.get(owner, ("", 0.0))
         if not hmac.compare_digest(known, digest(token)):
             raise ClientError(
                 "refused",
                 "the token is not one of this name: the operator issues one with `daedalus certs issue client NAME`",
             )
         _check_expiry(expires)
+        return owner
 
-    def check_viewer(self, token: str) -> None:
-        """Raise ClientError unless the token is that of any client or operator."""
+    def check_viewer(self, token: str) -> str:
+        """Return the owner of the token of any client or operator. Raises ClientError if it is no such token."""
         self._read()
-        self._check_among(self._tokens, token, "the page needs a token: of a client, or of an operator")
+        return self._check_among(self._tokens, token, "the page needs a token: of a client, or of an operator")
 
     def check_operator(self, token: str) -> None:
         """Raise ClientError unless the token is that of an operator."""
@@ -64,12 +69,14 @@ class Tokens:
         operators = {name: entry for name, entry in self._tokens.items() if name.startswith(OPERATOR)}
         self._check_among(operators, token, "this needs an operator's token (daedalus certs issue operator NAME)")
 
-    def _check_among(self, tokens: dict[str, tuple[str, float]], token: str, refusal: str) -> None:
+    def _check_among(self, tokens: dict[str, tuple[str, float]], token: str, refusal: str) -> str:
         given = digest(token)
-        found = [expires for known, expires in tokens.values() if hmac.compare_digest(known, given)]
+        found = [(expires, owner) for owner, (known, expires) in tokens.items() if hmac.compare_digest(known, given)]
         if not found:
             raise ClientError("refused", refusal)
-        _check_expiry(max(found))
+        expires, owner = max(found)
+        _check_expiry(expires)
+        return owner
 
     def _read(self) -> None:
         try:

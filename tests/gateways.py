@@ -16,7 +16,6 @@ from websockets.sync.client import ClientConnection, connect
 from daedalus.gateway.app import application
 from daedalus.gateway.config import GatewayConfig
 from daedalus.gateway.gateway import Gateway
-from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import OperatorToken, Tokens
@@ -39,18 +38,22 @@ class RunningGateway:
         *,
         follows: bool = True,
         operator: OperatorToken | None = None,
+        takes_clients: bool = True,
+        reads_openly: bool = True,
     ) -> None:
         """Start a gateway.
 
         Args:
           network: the network that it connects to.
           certificates: folder of a gateway; None: plain WebSockets on loopback.
-          operator: token for orders.
-          follows: whether it follows a run; otherwise it serves raw clients only.
+          operator: token for the page.
+          takes_clients: whether it has clients, or the page only.
+          reads_openly: whether the page needs no token if there is none.
+          follows: whether it follows a run; otherwise it serves its page only.
         """
-        self._follows, self._operator = follows, operator
-        self._open_transport = lambda: MemoryTransport(network)
-        self._transport = self._open_transport()
+        self._follows, self._operator, self._reads_openly = follows, operator, reads_openly
+        self._takes_clients = takes_clients
+        self._transport = MemoryTransport(network)
         self._tokens = None if certificates is None else Tokens(certificates)
         self._tls = None if certificates is None else tls_context(certificates)
         self._config = GatewayConfig(name="gateway")
@@ -68,18 +71,14 @@ class RunningGateway:
         gateway = Gateway(self._transport, self._config, self._fail)
         if self._follows:
             gateway.open()
-        self.data = PageData()
+        self.data = PageData(takes_clients=self._takes_clients)
         ready.set_result(gateway)
-        rules = guard(LOOPBACK, self.port, [], self._tokens, self._operator)
-        raw = RawEndpoint(self._open_transport, rules, self._config.actor_name)
-
-        async def close() -> None:
-            await raw.close()
-            await gateway.close()
-
+        rules = guard(LOOPBACK, self.port, [], self._tokens, self._operator, reads_openly=self._reads_openly)
         reached: asyncio.Future[Gateway] = self.loop.create_future()
         reached.set_result(gateway)
-        await Server(application(reached, raw, rules, self.data), self._tls).run_until(self._stop, self.listener, close)
+        await Server(application(reached, rules, self.data), self._tls).run_until(
+            self._stop, self.listener, gateway.close
+        )
 
     def _fail(self, error: Exception) -> None:
         self.failure = error

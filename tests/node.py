@@ -1,6 +1,5 @@
-"""Node and the packages of examples/node. Tests that need them are skipped if they are not installed."""
+"""Node. Tests that need it are skipped if it is not installed, or too old."""
 
-import functools
 import importlib.util
 import os
 import shutil
@@ -8,17 +7,6 @@ import subprocess
 from pathlib import Path
 
 import pytest
-
-FOLDER = Path(__file__).parents[1] / "examples" / "node"
-_OLDEST = (22, 18)  # the first version that runs TypeScript files
-
-
-@functools.cache
-def program() -> str:
-    """Return the path of a Node that runs TypeScript. Skip the test if Node or the packages are missing."""
-    if not (FOLDER / "node_modules").is_dir():
-        pytest.skip("the packages of examples/node are not installed: run `make examples`")
-    return executable(_OLDEST, "TypeScript")
 
 
 def executable(oldest: tuple[int, int], feature: str) -> str:

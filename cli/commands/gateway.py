@@ -6,10 +6,12 @@ Exit status: 0 stopped by a signal, 1 failed, 2 bad usage.
 import argparse
 import asyncio
 import errno
+import os
 import re
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,9 +40,8 @@ LISTEN = "127.0.0.1:8080"
 
 DESCRIPTION = """\
 Lets programs in any language be actors, over a WebSocket: they send observations and rewards, and the gateway runs the
-policy, collects the rollouts and sends them to the learner. Programs that run the policy themselves exchange the
-messages of docs/wire.md with it. On loopback everybody may connect; any other address needs --serve-tls, and each
-client a token. Its page shows the run live in a browser."""
+policy, collects the rollouts and sends them to the learner. On loopback every user of the machine may connect; any
+other address needs --serve-tls, and each client a token. Its page shows the run live in a browser."""
 
 EXAMPLES = """\
 examples:
@@ -70,6 +71,7 @@ def parser() -> argparse.ArgumentParser:
     add_logging(options)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--or-any-port", action="store_true", help=argparse.SUPPRESS)
+    options.add_argument("--page-only", action="store_true", help=argparse.SUPPRESS)
     return options
 
 
@@ -116,8 +118,9 @@ def _add_page(options: argparse.ArgumentParser) -> None:
         "--operator-token",
         type=Path,
         metavar="FILE",
-        help="file with the token that the page's buttons need; it is written if it is missing. Without it the page is "
-        "read-only. With --serve-tls, operators have the tokens of `daedalus certs`",
+        help="file with the token that the page asks for; it is written if it is missing. Without it the page is "
+        "read-only, and shows only what every user of this machine may ask the learner. With --serve-tls, operators "
+        "have the tokens of `daedalus certs`",
     )
     options.add_argument(
         "--operator",
@@ -209,9 +212,13 @@ def _camera(arguments: argparse.Namespace) -> tuple[str, ...]:
     return (sys.executable, "-P", "-m", "daedalus.cli.commands.camera", *allow_words(arguments.allow_module), *values)
 
 
-def _announce(address: str) -> None:
-    """Print the address of the page, for the person who started the run."""
-    print(f"watch the run at {address}", flush=True)
+def _announce(token_file: Path | None) -> Callable[[str], None]:
+    """Return a function that prints the address of the page, for the person who started the run.
+
+    It does not print the token: the output may go to a log that others can read.
+    """
+    token = "" if token_file is None else f" with the token in {os.path.relpath(token_file)}"
+    return lambda address: print(f"watch the run at {address}{token}", flush=True)
 
 
 async def _serve(
@@ -232,7 +239,8 @@ async def _serve(
         operator_token=chosen.operator_token,
         other_runs=chosen.other_runs,
         camera=None if arguments.no_camera else _camera(arguments),
-        announce=_announce if arguments.exit_with_parent else None,
+        takes_clients=not arguments.page_only,
+        announce=_announce(arguments.operator_token) if arguments.exit_with_parent else None,
     )
     await GatewayService(settings, stop).run(listener)
 

@@ -214,7 +214,12 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
         "--watch",
         action="store_true",
         help="show the run on a page in a browser, at http://127.0.0.1:8080, or at another port if that is taken. The "
-        "token for its buttons is in RUN_DIR/operator-token",
+        "token that it asks for is in RUN_DIR/operator-token",
+    )
+    options.add_argument(
+        "--clients",
+        action="store_true",
+        help="let every user of this machine take part at /actor and /play of that page (with --watch)",
     )
     options.add_argument("--no-camera", action="store_true", help="play no episodes for the page (with --watch)")
     add_processes(options)
@@ -225,7 +230,9 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
 
 
 def _check_watching(parsed: argparse.Namespace) -> None:
-    """Raise SettingsError if the gateway's packages are missing."""
+    """Raise SettingsError if the gateway's packages are missing, or there is no gateway."""
+    if parsed.clients and not parsed.watch:
+        raise SettingsError("--clients is for the page of the run: add --watch, or start `daedalus gateway`")
     if parsed.watch and not all(map(find_spec, GATEWAY_PACKAGES)):
         raise SettingsError(f"--watch: {INSTALL}")
 
@@ -264,6 +271,7 @@ def _run(
         tls=parsed.tls,
         insecure=parsed.insecure,
         watch=parsed.watch,
+        clients=parsed.clients,
         camera=not parsed.no_camera,
         log=chosen_trackers(parsed.log, directory),
         log_level=parsed.log_level,

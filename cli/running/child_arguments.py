@@ -56,7 +56,7 @@ def gateway_arguments(run: LocalRun) -> tuple[str, ...]:
     filming = [*allow_settings(run.spec.user_modules), "--checkpoints", str(run.directory)]
     camera = filming if run.camera else ["--no-camera"]
     token = ("--operator-token", str(run.directory / run_directory.OPERATOR_TOKEN))
-    return *_logging(level, run.log_json), *token, *camera
+    return *_logging(level, run.log_json), *token, *camera, *([] if run.clients else ["--page-only"])
 
 
 def _logging(level: str, as_json: bool) -> tuple[str, ...]:

@@ -51,6 +51,7 @@ class LocalRun:
     log_json: bool = False
     watch: bool = False  # start a gateway with the page of the run
     camera: bool = True  # with a camera
+    clients: bool = False  # with the page, let clients take part
     log: Sequence[str] = ()  # trackers that the run is logged to
     observer: RunObserver = field(default_factory=RunObserver)
 

@@ -13,7 +13,8 @@ const connection = new Connection({
   opened(hello) {
     byId("ask-token").hidden = true;
     learning.forgetOthers();
-    orders.offer(hello.orders);
+    orders.offer(hello.orders, byId("token").value);
+    summary.takesClients = hello.clients;
     camera.offer(hello.camera);
   },
   message(message) {

@@ -18,8 +18,9 @@ export class Orders {
     };
   }
 
-  /** Show the buttons if the gateway takes orders. */
-  offer(offered) {
+  /** Show the buttons if the gateway takes orders. `token` is the one that the page reads with. */
+  offer(offered, token) {
+    byId("operator-token").value ||= token;
     byId("orders").hidden = !offered;
     byId("read-only").hidden = offered;
   }

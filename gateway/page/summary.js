@@ -23,6 +23,8 @@ export class Summary {
   #seen = { state: "connecting", reason: "", status: null };
   #tiles = new Map();
 
+  takesClients = false; // whether /play may take part
+
   constructor(metrics) {
     this.metrics = metrics;
   }
@@ -37,7 +39,8 @@ export class Summary {
     if (status === null) return;
     setText(byId("run"), status.run);
     setText(byId("what"), `${status.environment}, ${status.algorithm}`);
-    byId("play").hidden = !/^CartPole-v[01]$/.test(status.environment) || state === "ended";
+    const plays = /^CartPole-v[01]$/.test(status.environment) && state !== "ended";
+    byId("play").hidden = !plays || !this.takesClients;
     this.#progress(status);
     this.tiles();
     document.title = `${status.run}: ${number(status.episode_return_mean)} - Daedalus`;

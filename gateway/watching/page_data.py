@@ -4,12 +4,13 @@ import asyncio
 from collections.abc import AsyncGenerator, Callable
 from typing import Protocol
 
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.places import Places
 from daedalus.gateway.watching.observation import Observation
 from daedalus.gateway.watching.source import OtherRun
 from daedalus.protocol.orders import Order
 
 MAX_VIEWERS = 32
+_OPERATORS = 4  # further pages, for operators
 
 GiveOrder = Callable[[Order], str]  # waits for the learner; returns why it is not accepted, or an empty string
 
@@ -29,36 +30,31 @@ def _nobody(order: Order) -> str:
 class PageData:
     """What all viewers see. For the event loop."""
 
-    def __init__(self, other_runs: Callable[[], list[OtherRun]] = lambda: [], camera: Camera | None = None) -> None:
+    def __init__(
+        self,
+        other_runs: Callable[[], list[OtherRun]] = lambda: [],
+        camera: Camera | None = None,
+        *,
+        takes_clients: bool = True,
+    ) -> None:
         """Construct the data.
 
         Args:
           other_runs: reads the runs to compare with; it may take long.
           camera: shows episodes; None: there is no camera.
+          takes_clients: whether the gateway has clients too; otherwise it serves its page only.
         """
-        self.other_runs, self.camera = other_runs, camera
+        self.other_runs, self.camera, self.takes_clients = other_runs, camera, takes_clients
         self.seen = Observation()
         self.give_order: GiveOrder = _nobody
         self.on_watch: Callable[[bool], None] = lambda watched: None  # receives whether anybody watches
-        self._viewers = 0
+        self.places = Places(MAX_VIEWERS, "pages", reserved=_OPERATORS)
         self._changed = asyncio.Event()
-
-    def enter(self) -> None:
-        """Count a viewer. Raises ClientError if there are too many."""
-        if self._viewers >= MAX_VIEWERS:
-            raise ClientError("unavailable", f"{MAX_VIEWERS} pages are open already: close one")
-        self._viewers += 1
-        self.on_watch(True)
-
-    def leave(self) -> None:
-        """Count a viewer no more."""
-        self._viewers -= 1
-        self.on_watch(self._viewers > 0)
 
     @property
     def is_watched(self) -> bool:
         """Whether anybody watches."""
-        return self._viewers > 0
+        return self.places.taken > 0
 
     def show(self, seen: Observation) -> None:
         """Show an observation to all viewers."""

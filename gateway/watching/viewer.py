@@ -11,6 +11,7 @@ from daedalus.gateway.channel import channel_of
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.rate_limit import RateLimit
 from daedalus.gateway.security import Guard
+from daedalus.gateway.tokens import OPERATOR
 from daedalus.gateway.watching import observation, viewer_messages
 from daedalus.gateway.watching.observation import Observation
 from daedalus.gateway.watching.page_data import PageData
@@ -34,25 +35,43 @@ class ViewerConnection:
         self._rate = RateLimit(_RATE, _BURST)
         self._sent: Observation | None = None
         self._camera: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[Any] | None = None
+        self._end: ClientError | None = None  # why the gateway ends the connection
 
     async def serve(self) -> None:
         """Serve the page until it is closed."""
+        self._task = asyncio.current_task()
         await self._receive()  # the request to connect
         self._channel.limit(viewer_messages.MAX_BYTES)
         await self._send_event({"type": "websocket.accept"})
         try:
-            await self._greet()
-            self._data.enter()
+            owner = await self._greet()
+            is_operator = owner.startswith(OPERATOR)
             try:
-                await self._converse()
+                with self._data.places.take(owner or self._channel.peer, self.end, is_operator=is_operator):
+                    self._channel.settle(True)
+                    self._data.on_watch(True)
+                    await self._converse()
             finally:
-                self._data.leave()
+                self._data.on_watch(self._data.is_watched)
         except ClientError as error:
             await self._finish(error)
+        except asyncio.CancelledError:
+            if self._end is None or self._task is None:
+                raise
+            self._task.uncancel()
+            await self._finish(self._end)
         except (OSError, EOFError):
             pass  # the page is closed
 
-    async def _greet(self) -> None:
+    def end(self, reason: ClientError) -> None:
+        """End the connection: another page needs its place. Idempotent."""
+        if self._end is None and self._task is not None:
+            self._end = reason
+            self._task.cancel()
+
+    async def _greet(self) -> str:
+        """Return the owner of the page's token."""
         try:
             async with asyncio.timeout(_HELLO_SECONDS):
                 message = await self._next()
@@ -60,11 +79,12 @@ class ViewerConnection:
             raise ClientError("malformed", f"no hello came within {_HELLO_SECONDS:g} s") from None
         if not isinstance(message, ViewerHello):
             raise ClientError("out_of_turn", "the first message must be a hello")
-        self._guard.check_viewer(message.token)
+        return self._guard.check_viewer(message.token)
 
     async def _converse(self) -> None:
-        hello = {"type": "hello", "orders": self._guard.takes_orders, "camera": self._data.camera is not None}
-        await self._send(hello)
+        data = self._data
+        offers = {"orders": self._guard.takes_orders, "camera": data.camera is not None, "clients": data.takes_clients}
+        await self._send({"type": "hello", **offers})
         showing = asyncio.create_task(self._show())
         try:
             await self._obey()
@@ -120,6 +140,7 @@ class ViewerConnection:
 
     async def _finish(self, error: ClientError) -> None:
         """Say why the connection ends, and close it."""
+        self._channel.settle(False)
         code = _TRY_LATER if error.code == "unavailable" else _FAULT
         message = {"type": "error", "code": error.code, "reason": error.reason}
         with contextlib.suppress(TimeoutError, OSError):

@@ -11,7 +11,6 @@ PAGES = sorted(
     [
         *DOCS.rglob("*.md"),
         *ROOT.glob("*.md"),
-        ROOT / "examples" / "node" / "README.md",
         ROOT / "policy" / "pretrained" / "car_racing" / "README.md",
     ]
 )

@@ -1,4 +1,4 @@
-"""docs/wire.md against the messages, the specification and the packets of the code."""
+"""docs/wire.md against the messages and the specification of the code."""
 
 import dataclasses
 import re
@@ -7,7 +7,6 @@ import typing
 import pytest
 from pages import DOCS
 
-from daedalus.gateway.raw.packets import Kind
 from daedalus.protocol import messages
 from daedalus.protocol.codec import PROTOCOL_VERSION
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
@@ -70,11 +69,6 @@ def test_the_specifications_tables_have_what_an_actor_needs() -> None:
     environment = first_column(table_under("| `environment.` |")) | {"backend", "processes"}  # named in the row of `id`
     assert environment == set(EnvironmentSpec.model_fields)
     assert first_column(table_under("| `collection.` |")) == set(CollectionSpec.model_fields) - {"actors"}
-
-
-def test_the_gateways_packets_are_all_explained() -> None:
-    rows = re.findall(r"^\| (\d+) \| (\w+) \|", WIRE, re.MULTILINE)
-    assert {(int(number), kind) for number, kind in rows} == {(kind.value, kind.name.lower()) for kind in Kind}
 
 
 def test_the_page_is_for_this_version() -> None:

@@ -42,6 +42,8 @@ def command(program: str, port: str, name: str, folder: Path) -> list[str]:
     address = f"ws://127.0.0.1:{port}/actor"
     if program == "client.js":
         return [node.executable((22, 0), "WebSockets"), str(FOLDER / program), address, name]
+    if program == "client.ts":
+        return [node.executable((22, 18), "TypeScript"), str(FOLDER / program), address, name]
     if program == "client.py":
         return [sys.executable, str(FOLDER / program), address, name]
     compiler = shutil.which("cc")
@@ -52,7 +54,7 @@ def command(program: str, port: str, name: str, folder: Path) -> list[str]:
     return [str(built), port, name]
 
 
-@pytest.mark.parametrize("program", ["client.py", "client.js", "client.c"])
+@pytest.mark.parametrize("program", ["client.py", "client.js", "client.ts", "client.c"])
 def test_learner_trains_on_what_a_client_plays(run: tuple[str, str], tmp_path: Path, program: str) -> None:
     address, port = run
     name = program.replace(".", "-")
@@ -73,6 +75,30 @@ def test_learner_trains_on_what_a_client_plays(run: tuple[str, str], tmp_path: P
         client.end()
 
 
-@pytest.mark.parametrize("program", ["client.py", "client.js", "client.c"])
-def test_client_has_at_most_60_lines(program: str) -> None:
-    assert len((FOLDER / program).read_text().splitlines()) <= 60
+@pytest.mark.parametrize(
+    ("program", "lines"), [("client.py", 60), ("client.js", 60), ("client.c", 60), ("client.ts", 100)]
+)
+def test_client_is_short(program: str, lines: int) -> None:
+    assert len((FOLDER / program).read_text().splitlines()) <= lines
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ("", ""),
+        ('{ type: "act", observation, reward }', '{ type: "act", observations: observation, reward }'),
+        ("terminated: fallen, observation: state, reward: 1", "terminated: fallen, reward: 1"),
+        ("await actor.act(state,", "await actor.act([1],"),
+    ],
+)
+def test_types_of_the_typescript_client_are_those_of_the_messages(tmp_path: Path, right: str, wrong: str) -> None:
+    compiler = FOLDER / "node_modules" / "typescript" / "bin" / "tsc"
+    if not compiler.is_file():
+        pytest.skip("the packages of examples/gateway are not installed: run `make examples`")
+    for name in ("client.ts", "tsconfig.json", "package.json"):
+        (tmp_path / name).write_text((FOLDER / name).read_text().replace(right, wrong))
+    (tmp_path / "node_modules").symlink_to(FOLDER / "node_modules")
+    checked = subprocess.run(
+        [node.executable((22, 18), "TypeScript"), str(compiler), "-p", str(tmp_path)], capture_output=True, check=False
+    )
+    assert (checked.returncode == 0) == (right == wrong), checked.stdout

@@ -17,8 +17,8 @@ from watched import HOSTILE, actor_status, observed, run_status
 
 from daedalus.cli.commands.certs import certs
 from daedalus.cli.status_query import ask
+from daedalus.gateway.places import Places
 from daedalus.gateway.tokens import OperatorToken
-from daedalus.gateway.watching import page_data
 from daedalus.protocol.orders import Order
 from daedalus.protocol.status import Event
 from daedalus.transport.connecting import connect
@@ -65,6 +65,13 @@ def show(gateway: RunningGateway, *arguments: Any, **fields: Any) -> None:
     gateway.call(lambda: gateway.data.show(observed(*arguments, **fields)))
 
 
+def enter(page: Any, token: str) -> Any:
+    """Give the page the token that it asks for, and return the page."""
+    page.locator("#token").fill(token)
+    page.get_by_role("button", name="Open").click()
+    return page
+
+
 def wait_for(page: Any, expression: str) -> None:
     """Wait until an expression of JavaScript is true. The page forbids what Playwright's own wait does."""
     until(lambda: page.evaluate(expression))
@@ -83,20 +90,22 @@ class Run:
     def __init__(self, process: Running) -> None:
         self.process = process
         self.learner = process.expect(r" at (unixsock-stream/\S+);")[1]
-        self.address = process.expect(r"watch the run at (http\S+)")[1]
+        found = process.expect(r"watch the run at (http\S+) with the token in run/operator-token$")
+        self.address = found[1]
+        self.token = (Path(os.readlink(f"/proc/{process.process.pid}/cwd")) / "run/operator-token").read_text().strip()
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[tuple[Run, Callable[..., Running]]]:
     """A run, and a function that starts further commands. Asking for the browser first skips without one."""
     with starting(tmp_path_factory.mktemp("watched")) as start:
-        process = start("train", "cartpole", "--watch", "--run-dir", "run", "--actors", 1, *ENDLESS)
+        process = start("train", "cartpole", "--watch", "--clients", "--run-dir", "run", "--actors", 1, *ENDLESS)
         yield Run(process), start
 
 
 def test_curves_appear_and_a_killed_actor_shows_as_gone(run: tuple[Run, Callable[..., Running]], visit: Open) -> None:
     watched, start = run
-    page = visit(watched.address).page
+    page = enter(visit(watched.address).page, watched.token)
     page.wait_for_selector("#charts .line", timeout=MILLISECONDS)
     wait_for(page, "document.querySelectorAll('#charts .line').length >= 5")
     wait_for(page, "document.querySelector('#state').textContent === 'running'")
@@ -112,7 +121,7 @@ def test_curves_appear_and_a_killed_actor_shows_as_gone(run: tuple[Run, Callable
 def test_a_page_that_is_opened_late_shows_the_run_from_its_begin(
     run: tuple[Run, Callable[..., Running]], visit: Open
 ) -> None:
-    page = visit(run[0].address).page
+    page = enter(visit(run[0].address).page, run[0].token)
     wait_for(page, "document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
     label = page.locator("#charts svg").first.get_attribute("aria-label")
     assert "from" in label
@@ -137,7 +146,7 @@ def test_three_pages_that_play_are_three_actors_that_the_run_learns_from(
 
 
 def test_an_episode_is_shown_on_request(run: tuple[Run, Callable[..., Running]], visit: Open) -> None:
-    page = visit(run[0].address).page
+    page = enter(visit(run[0].address).page, run[0].token)
     page.locator("#camera-switch:enabled").click()
     page.wait_for_selector("#camera-view .bars li:nth-child(2)", timeout=MILLISECONDS)
     assert page.locator("#camera-view canvas").evaluate("canvas => canvas.width") > 300
@@ -150,11 +159,12 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
 ) -> None:
     process, visited = run[0].process, visit(run[0].address)
     page, visited.loses_gateway = visited.page, True
-    token = (Path(os.readlink(f"/proc/{process.process.pid}/cwd")) / "run" / "operator-token").read_text().strip()
+    enter(page, run[0].token)
+    assert page.locator("#operator-token").input_value() == run[0].token
     page.locator("#operator-token").fill("wrong")
     page.get_by_role("button", name="Save a checkpoint").click()
     wait_for(page, "document.querySelector('#order-result').textContent.startsWith('Not done')")
-    page.locator("#operator-token").fill(token)
+    page.locator("#operator-token").fill(run[0].token)
     page.get_by_role("button", name="Stop the run").click()
     page.get_by_role("dialog").get_by_role("button", name="Keep running").click()
     assert process.process.poll() is None
@@ -208,7 +218,7 @@ def test_an_order_that_the_gateway_does_not_receive_or_answer_is_reported(
         visited = visit(f"http://127.0.0.1:{gateway.port}/")
         page, visited.loses_gateway = visited.page, True
         show(gateway, run_status())
-        page.locator("#operator-token").fill(TOKEN)
+        enter(page, TOKEN)
         page.get_by_role("button", name="Save a checkpoint").click()
         page.wait_for_selector("#order-result:has-text('Asking the learner')")
         assert asked.wait(LIMIT)
@@ -223,12 +233,10 @@ def test_an_order_that_the_gateway_does_not_receive_or_answer_is_reported(
     page.wait_for_selector("#order-result:has-text('Not done: the gateway does not answer')")
 
 
-def test_a_page_that_is_not_served_says_why(
-    gateway: RunningGateway, visit: Open, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page_data, "MAX_VIEWERS", 0)
+def test_a_page_that_is_not_served_says_why(gateway: RunningGateway, visit: Open) -> None:
+    gateway.call(lambda: setattr(gateway.data, "places", Places(0, "pages")))
     page = visit(f"http://127.0.0.1:{gateway.port}/").page
-    page.wait_for_selector("#notices:has-text('0 pages are open already: close one')")
+    page.wait_for_selector("#notices:has-text('0 pages are connected already: try again later')")
 
 
 def test_play_takes_no_part_in_a_run_of_another_environment(network: MemoryNetwork, visit: Open) -> None:

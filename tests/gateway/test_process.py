@@ -81,3 +81,18 @@ def test_host_that_cannot_be_found_is_reported_in_one_line(start: Start) -> None
     assert line.startswith("daedalus gateway: cannot listen on no.such.host.invalid:0: ")
     assert line.endswith(": choose another --listen")
     assert "Unknown error" not in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--listen", "localhost"), "not an address"),
+        (("--listen", "0.0.0.0:0"), "is unencrypted and open to every host"),
+        (("--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
+    ],
+    ids=str,
+)
+def test_bad_usage_is_reported(start: Start, arguments: tuple[str, ...], complaint: str) -> None:
+    gateway = start("gateway", *(() if "--connect" in arguments else ("--connect", "tcp/127.0.0.1:1")), *arguments)
+    assert gateway.wait() == 2
+    gateway.expect(complaint)

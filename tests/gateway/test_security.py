@@ -1,10 +1,16 @@
 """Who may use a gateway: tokens, TLS, origins and hosts; and the limits of one client."""
 
 import contextlib
+import functools
 import gc
 import json
+import logging
+import os
+import resource
 import socket
 import ssl
+import subprocess
+import sys
 import urllib.error
 import urllib.request
 import weakref
@@ -16,10 +22,10 @@ import pytest
 from gateways import JsonClient, RunningGateway
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
-from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
 from daedalus.cli.commands.certs import certs
-from daedalus.gateway import server
+from daedalus.gateway import app, places, server
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.rate_limit import RateLimit
 from daedalus.gateway.security import guard
@@ -166,11 +172,31 @@ def test_requests_of_other_pages_and_under_other_names_are_refused(
     assert "unsafe" not in policy
 
 
-def test_page_of_another_site_cannot_open_a_websocket(learner: ScriptedLearner, connect: Connect) -> None:
-    with pytest.raises(InvalidStatus) as refused:
-        connect(origin="http://evil.example")
-    assert refused.value.response.status_code == 403
-    assert b"allow them with --allow-origin" in refused.value.response.body
+@pytest.mark.parametrize("path", ["/actor", "/watch"])
+@pytest.mark.parametrize(
+    ("origin", "host", "reason"),
+    [
+        ("http://evil.example", "", b"allow them with --allow-origin"),
+        ("null", "", b"allow them with --allow-origin"),
+        ("http://127.0.0.1:1", "", b"allow them with --allow-origin"),  # another program on this machine
+        ("http://evil.example:PORT", "evil.example:PORT", b"add it with --host"),  # DNS rebinding
+    ],
+)
+def test_page_of_another_site_cannot_open_a_websocket(
+    gateway: RunningGateway, path: str, origin: str, host: str, reason: bytes
+) -> None:
+    port, request = (
+        str(gateway.port),
+        f"GET {path} HTTP/1.1\r\nHost: {host or '127.0.0.1:PORT'}\r\nOrigin: {origin}\r\n",
+    )
+    with (
+        socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as connection,
+        connection.makefile("rb") as answer,
+    ):
+        connection.sendall(request.replace("PORT", port).encode() + HANDSHAKE + b"\r\n")
+        content = answer.read()
+    assert content.startswith(b"HTTP/1.1 403")
+    assert reason in content
 
 
 def test_allowed_origins_and_names_are_the_gateways_and_those_of_the_user() -> None:
@@ -238,12 +264,195 @@ def test_large_first_messages_that_do_not_end_are_limited_and_the_oldest_ends(
         assert client.receive()["code"] == "malformed", "it was not ended"
 
 
-def test_connections_are_limited(learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "_MAX_CONNECTIONS", 2)
-    clients = [connect() for _ in range(2)]
-    with pytest.raises((InvalidMessage, ConnectionError, EOFError)):
-        connect()
-    assert [client.hello(f"c-{number}")["type"] for number, client in enumerate(clients)] == ["welcome"] * 2
+def ended(connection: socket.socket) -> bool:
+    """Return whether the other end has closed a connection."""
+    connection.settimeout(LIMIT)
+    try:
+        return connection.recv(1) == b""
+    except ConnectionResetError:
+        return True
+
+
+@pytest.mark.parametrize("secure", [False, True])
+def test_of_silent_connections_the_oldest_give_way_and_clients_stay(
+    network: MemoryNetwork, folder: Path, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch, secure: bool
+) -> None:
+    monkeypatch.setattr(server, "_REQUEST_SECONDS", 1e6)
+    monkeypatch.setattr(server, "most_connections", lambda: 6)
+    running = RunningGateway(network, folder / "gateway" if secure else None)
+    try:
+        connect = functools.partial(secure_client, running, folder) if secure else lambda: JsonClient(running.port)
+        known, given = connect(), token(folder, "phone") if secure else ""
+        assert known.hello("phone.1", token=given)["type"] == "welcome"
+        waiting = [socket.create_connection(("127.0.0.1", running.port), LIMIT) for _ in range(20)]
+        late = connect()
+        assert late.hello("phone.2", token=given)["type"] == "welcome"
+        assert all(ended(connection) for connection in waiting[:15])
+        assert known.act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
+        for client in (known, late, *waiting):
+            client.close()
+    finally:
+        running.close()
+
+
+def test_address_with_the_most_silent_connections_gives_way_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "most_connections", lambda: 4)
+    crowd, given_way = server.Crowd(), list[str]()
+
+    def add(name: str, address: str) -> server.Link:
+        link = server.Link(address, lambda: given_way.append(name))
+        crowd.add(link)
+        return link
+
+    add("honest", "10.0.0.1")
+    add("attacker 1", "2001:db8::1")
+    settled = add("client", "10.0.0.2")
+    crowd.settle(settled)
+    add("attacker 2", "2001:db8::2")
+    add("attacker 3", "2001:db8::ffff:3")  # an IPv6 network is one address
+    add("attacker 4", "2001:db8::4")
+    assert given_way == ["attacker 1", "attacker 2"]
+    crowd.remove(settled)
+    add("another", "10.0.0.3")
+    assert given_way == ["attacker 1", "attacker 2"]
+
+
+def test_gateway_has_descriptors_left_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = {1024: 768, 256: 128, 1 << 20: 2048, resource.RLIM_INFINITY: 2048}
+    for limit, most in limits.items():
+        monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
+        assert places.most_connections() == most
+
+
+def test_owner_with_the_most_places_gives_one_to_an_owner_with_fewer() -> None:
+    seats, gone = places.Places(4, "clients", reserved=1), list[str]()
+    with contextlib.ExitStack() as stack:
+
+        def take(owner: str, name: str, **options: bool) -> None:
+            stack.enter_context(seats.take(owner, lambda error: gone.append(name), **options))
+
+        for number in range(4):
+            take("greedy", f"greedy {number}")
+        with pytest.raises(ClientError, match="4 clients are connected already: try again later"):
+            take("greedy", "greedy 4")
+        take("arm", "arm 0")
+        take("arm", "arm 1")
+        assert gone == ["greedy 3", "greedy 2"]
+        with pytest.raises(ClientError, match="already"):
+            take("arm", "arm 2")  # it would have more than the other
+        take("operator:alice", "alice", is_operator=True)  # nobody gives way
+        assert (gone, seats.taken) == (["greedy 3", "greedy 2"], 5)
+    assert seats.taken == 0
+
+
+def test_one_token_does_not_shut_out_others(
+    network: MemoryNetwork, folder: Path, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "MAX_CLIENTS", 3)
+    running = RunningGateway(network, folder / "gateway")
+    try:
+        phone, arm = token(folder, "phone"), token(folder, "arm")
+        greedy = [secure_client(running, folder) for _ in range(3)]
+        for number, client in enumerate(greedy):
+            assert client.hello(f"phone.{number}", token=phone)["type"] == "welcome"
+        for name, given, answer in (("phone.3", phone, "error"), ("arm", arm, "welcome")):
+            client = secure_client(running, folder)
+            assert client.hello(name, token=given)["type"] == answer
+            client.close()
+        ending = greedy[2].receive()
+        assert (ending["code"], "another needs one" in ending["reason"]) == ("unavailable", True)
+        assert greedy[0].act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
+        for client in greedy:
+            client.close()
+    finally:
+        running.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="only root can be another user")
+def test_peers_on_this_machine_are_its_users() -> None:
+    code = "import socket; s = socket.create_connection(('127.0.0.1', {})); s.recv(1)"
+    python = next(filter(os.path.exists, ("/usr/bin/python3", "/usr/local/bin/python3", sys.executable)))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(LIMIT)
+        command = [python, "-I", "-c", code.format(listener.getsockname()[1])]
+        process = subprocess.Popen(command, user=65534, cwd="/")
+        connection, remote = listener.accept()
+        with connection:
+            assert places.peer_of("127.0.0.1", connection.getsockname(), remote) == "user 65534"
+        process.wait()
+    assert places.peer_of("192.0.2.7", ("192.0.2.1", 1), ("192.0.2.7", 1)) == "192.0.2.7"
+
+
+HANDSHAKE = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: "
+HANDSHAKE += b"A" * 22 + b"==\r\n"
+ODD_REQUESTS = [
+    b"GET /\xff\xfe HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n",
+    b"GET /page/%ff%fe%00 HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n",
+    b"GET /?\xff=%ff HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: \xff\r\nX: \xff\xfe\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: localhost:PORT\r\nX-\xff: a\r\n\r\n",
+    b"\xff\xff / HTTP/1.1\r\n\r\n",
+    b"GET http://[::1 HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n",
+    *(
+        b"GET PATH HTTP/1.1\r\nHost: localhost:PORT\r\n".replace(b"PATH", path) + HANDSHAKE + more + b"\r\n" + frames
+        for path in (b"/actor", b"/watch", b"/none")
+        for more in (b"", b"X: \xff\xfe\r\n", b"Origin: http://\xff\r\n", b"Sec-WebSocket-Protocol: \xff,\xfe\r\n")
+        for frames in (
+            b"",
+            b"\x81\x82\0\0\0\0\xff\xfe",
+            b"\x88\x84\0\0\0\0\x03\xe8\xff\xfe",
+            b"\xff\xff",
+            b"\x83\x80\0\0\0\0",
+        )
+    ),
+    b"GET /watch?\xff HTTP/1.1\r\nHost: localhost:PORT\r\n" + HANDSHAKE + b"\r\n",
+    b"GET /%ff%fe?%ff=%fe HTTP/1.1\r\nHost: localhost:PORT\r\n" + HANDSHAKE + b"\r\n",
+]
+
+
+def test_bytes_that_are_no_text_make_no_traceback_and_few_lines(
+    learner: ScriptedLearner,
+    gateway: RunningGateway,
+    connect: Connect,
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    for request in ODD_REQUESTS:
+        with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as connection:
+            connection.sendall(request.replace(b"PORT", b"%d" % gateway.port))
+            connection.shutdown(socket.SHUT_WR)
+            with contextlib.suppress(ConnectionResetError):
+                while connection.recv(65536):
+                    pass
+    client = connect()
+    assert client.hello("phone")["type"] == "welcome"
+    client.socket.socket.sendall(b"\x81\x82\0\0\0\0\xff\xfe")
+    with pytest.raises(ConnectionClosed) as closed:
+        client.receive()
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1007
+    assert not any(record.exc_info for record in caplog.records)
+    lines = [record.getMessage() for record in caplog.records if record.name == server.__name__]
+    assert len(lines) <= 2, lines
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_the_libraries_log_is_one_line_and_is_counted(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handler, log = server.OneLine(), logging.Logger("uvicorn.error")
+    log.addHandler(handler)
+    monkeypatch.setattr(server, "_LINE_SECONDS", 3600.0)
+    try:
+        raise ValueError("several\nlines")
+    except ValueError:
+        for _ in range(1000):
+            log.exception("Exception in ASGI application\n")
+        handler.next_at = 0.0
+        log.exception("Exception in ASGI application\n")
+    first, second = [record.getMessage() for record in caplog.records]
+    assert first.startswith("Exception in ASGI application: ValueError: several lines (test_security.py:")
+    assert second.endswith("(999 records before this one were left out)")
 
 
 def test_connection_without_a_further_request_is_closed(

@@ -15,14 +15,15 @@ from typing import Any
 import pytest
 from gateways import RunningGateway
 from processes import LIMIT, until
+from scripted_learner import ScriptedLearner
 from watched import FakeSource, actor_status, observed, run_status
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from daedalus.cli.commands.certs import certs
 from daedalus.gateway.errors import ClientError
+from daedalus.gateway.places import Places
 from daedalus.gateway.tokens import TOKENS, OperatorToken, Tokens, digest
-from daedalus.gateway.watching import page_data
 from daedalus.gateway.watching.source import OtherRun
 from daedalus.transport.memory import MemoryNetwork
 
@@ -71,7 +72,7 @@ def gateway(network: MemoryNetwork, tmp_path: Path) -> Iterator[RunningGateway]:
 def watch(gateway: RunningGateway) -> Iterator[Watch]:
     with ExitStack() as stack:
 
-        def open_one(token: str = "", **options: Any) -> Viewer:
+        def open_one(token: str = TOKEN, **options: Any) -> Viewer:
             socket = connect(f"ws://127.0.0.1:{gateway.port}/watch", open_timeout=LIMIT, max_size=None, **options)
             viewer = Viewer(stack.enter_context(socket))
             viewer.send(type="hello", token=token)
@@ -100,7 +101,7 @@ def _lowered(headers: Message) -> dict[str, str]:
 
 def test_a_page_that_is_opened_before_there_is_a_learner_says_so(watch: Watch) -> None:
     viewer = watch()
-    assert viewer.receive("hello") == {"type": "hello", "orders": True, "camera": False}
+    assert viewer.receive("hello") == {"type": "hello", "orders": True, "camera": False, "clients": True}
     assert viewer.receive("run") == {"type": "run", "state": "connecting", "reason": "", "status": None}
     # A page that was connected before may still show the actors and curves of another run.
     assert viewer.receive("actors")["rows"] == []
@@ -214,8 +215,19 @@ def test_first_message_must_be_a_hello(gateway: RunningGateway) -> None:
         assert viewer.closed() == 1008
 
 
-def test_viewers_are_limited(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_data, "MAX_VIEWERS", 1)
+@pytest.mark.parametrize("token", ["", "wrong"])
+def test_a_page_without_the_operators_token_reads_nothing(gateway: RunningGateway, watch: Watch, token: str) -> None:
+    noted: list[bool] = []
+    gateway.call(lambda: setattr(gateway.data, "on_watch", lambda watched: noted.append(watched) if watched else None))
+    viewer = watch(token)
+    message = json.loads(viewer.socket.recv(timeout=LIMIT))
+    assert (message["type"], message["code"]) == ("error", "refused")
+    assert viewer.closed() == 1008
+    assert noted == []
+
+
+def test_viewers_are_limited(gateway: RunningGateway, watch: Watch) -> None:
+    gateway.call(lambda: setattr(gateway.data, "places", Places(1, "pages")))
     watch().receive("hello")
     second = watch()
     assert second.receive("error")["code"] == "unavailable"
@@ -248,6 +260,39 @@ def test_pages_name_files_that_exist_and_have_no_inline_script(gateway: RunningG
 @pytest.mark.parametrize("path", ["/page/none.js", "/page/../server.py", "/page/%2e%2e%2fserver.py", "/page/", "/x"])
 def test_other_files_are_not_served(gateway: RunningGateway, path: str) -> None:
     assert fetch(gateway, path)[0] == 404
+
+
+def test_gateway_of_a_page_takes_no_clients(network: MemoryNetwork) -> None:
+    running = RunningGateway(network, follows=False, takes_clients=False, reads_openly=False)
+    try:
+        assert fetch(running, "/")[0] == 200
+        assert fetch(running, "/play")[0] == 403
+        for path, reason in (("actor", b"this gateway serves its page only"), ("raw", b"")):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(f"ws://127.0.0.1:{running.port}/{path}", open_timeout=LIMIT)
+            assert refused.value.response.status_code == 403
+            assert reason in (refused.value.response.body or b"")
+        with connect(f"ws://127.0.0.1:{running.port}/watch", open_timeout=LIMIT) as socket:
+            viewer = Viewer(socket)
+            viewer.send(type="hello", token="")
+            assert "start it with --operator-token FILE" in viewer.receive("error")["reason"]
+    finally:
+        running.close()
+
+
+@pytest.mark.parametrize("path", ["actor", "watch"])
+@pytest.mark.parametrize("kind", ["order", "drain", "status", "query", "metrics", "events", "actors"])
+def test_no_message_without_a_token_orders_or_asks_anything(
+    gateway: RunningGateway, learner: ScriptedLearner, path: str, kind: str
+) -> None:
+    orders: list[str] = []
+    gateway.call(lambda: setattr(gateway.data, "give_order", lambda order: orders.append(order) or ""))
+    with connect(f"ws://127.0.0.1:{gateway.port}/{path}", open_timeout=LIMIT) as socket:
+        socket.send(json.dumps({"type": kind, "order": "stop", "token": ""}))
+        assert json.loads(socket.recv(timeout=LIMIT))["code"] in ("malformed", "out_of_turn")
+        with pytest.raises(ConnectionClosed):
+            socket.recv(timeout=LIMIT)
+    assert orders == []
 
 
 def test_pages_are_refused_under_another_name(gateway: RunningGateway) -> None:
