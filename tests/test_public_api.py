@@ -155,7 +155,7 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
         ({"preset": "cartpole", "log": ["wandb", "x"]}, "log: unknown tracker 'x'"),
         (
             {"preset": "cartpole", "settings": {"environment.kwargs.x": np.zeros(2)}},
-            "setting environment.kwargs.x input was not a valid JSON value, not array",
+            "setting environment.kwargs.x is array([0., 0.]), which config.toml and messages to actors cannot",
         ),
     ],
 )

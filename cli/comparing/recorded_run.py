@@ -36,11 +36,18 @@ class RecordedRun:
     summary: Mapping[str, Any]  # summary.json; empty before the end of training
 
     def setting(self, path: str) -> Any:
-        """Return a setting, or the part of one that is a table, such as `environment.kwargs.size`; None if unset."""
+        """Return a setting, or the part of one that is a table, such as `environment.kwargs.size`; None if unset.
+
+        A part that is None is "none".
+        """
         section, *keys = path.split(".")
         value = self.settings.get(".".join((section, *keys[:1])))
         for key in keys[1:]:
-            value = value.get(key) if isinstance(value, Mapping) else None
+            value = (
+                (value[key] if value[key] is not None else "none")
+                if isinstance(value, Mapping) and key in value
+                else None
+            )
         return value
 
     @property

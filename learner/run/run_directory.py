@@ -29,7 +29,7 @@ import tomli_w
 from daedalus.learner.run import run_files
 from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
-from daedalus.learner.run.settings import SettingsError, read_settings, run_spec
+from daedalus.learner.run.settings import SettingsError, as_toml, read_settings, run_spec
 from daedalus.policy.saving.replacing import replace_text
 from daedalus.protocol import keys
 from daedalus.protocol.spec import RunSpec
@@ -169,7 +169,7 @@ def remove_failed(directory: Path) -> None:
 def write_config(directory: Path, spec: RunSpec) -> None:
     """Write config.toml: all settings, including defaults; unset settings are omitted. Raises SettingsError."""
     derived = {"training": {"algorithm_record"}}  # it is read from the class of the algorithm again
-    text = tomli_w.dumps(spec.model_dump(mode="json", exclude_none=True, exclude=derived))
+    text = tomli_w.dumps(as_toml(spec.model_dump(mode="json", exclude_none=True, exclude=derived)))
     try:
         replace_text(directory / CONFIG, text)
     except OSError as error:
