@@ -89,7 +89,7 @@ def versions_section(groups: Sequence[Group], records: Records) -> Html | None:
     for group in groups:
         for run in group.runs:
             record = records[run.directory]
-            shown = {name: value for name, value in record.versions.items() if name != "init_from"}
+            shown = {name: value for name, value in record.versions.items() if not name.startswith("init_from")}
             if shown:
                 columns.setdefault(tuple(sorted(shown.items())), []).append(record.name)
     if not columns:

@@ -100,7 +100,14 @@ def create(directory: Path, spec: RunSpec) -> None:
     create_locked(directory, spec).close()
 
 
-def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, init_from: Path | None = None) -> RunLock:
+def create_locked(
+    directory: Path,
+    spec: RunSpec,
+    *,
+    numbered: bool = False,
+    init_from: Path | None = None,
+    other_spaces: bool = False,
+) -> RunLock:
     """Create the directory of a new run, with config.toml and versions.json, and return its lock.
 
     Args:
@@ -108,6 +115,7 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
       spec: the settings of the run.
       numbered: add a number to the name if the directory exists; the lock has the resulting path.
       init_from: run whose weights the new run begins with, for versions.json, with its absolute path.
+      other_spaces: whether its spaces may be others, for versions.json.
 
     Raises SettingsError if the directory is not empty, locked, or cannot be created.
     """
@@ -120,7 +128,9 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
         try:
             check_free(directory)  # another process may have held the lock before
             write_config(directory, spec)
-            origin = {} if init_from is None else {"init_from": os.path.abspath(init_from)}
+            origin: dict[str, Any] = {} if init_from is None else {"init_from": os.path.abspath(init_from)}
+            if other_spaces:
+                origin["init_from_other_spaces"] = True
             write_json(directory / VERSIONS, {**_versions(), **origin})
         except BaseException:
             lock.close()
