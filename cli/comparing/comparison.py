@@ -47,6 +47,7 @@ class Comparison:
     evaluated: bool  # whether the final return is that of the final evaluation, and not of the last training episodes
     threshold: float | None
     results: Sequence[GroupResult]
+    unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in their names
 
 
 def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> Comparison:
@@ -80,7 +81,9 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
             )
         )
     environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
-    return Comparison(environment=environment, evaluated=evaluated, threshold=threshold, results=results)
+    return Comparison(
+        environment=environment, evaluated=evaluated, threshold=threshold, results=results, unnamed=groups[0].unnamed
+    )
 
 
 def final_returns(group: Group, *, evaluated: bool) -> np.ndarray:

@@ -59,6 +59,8 @@ def notes(comparison: Comparison) -> list[str]:
             "P(> first): probability that a run has a higher final return than one of the first group; "
             "0.5 if they are equal"
         )
+    if comparison.unnamed:
+        lines.append(f"the groups also differ in {', '.join(comparison.unnamed)}")
     if comparison.threshold is None:
         lines.append("env_steps and minutes to a return: name the return with `daedalus compare --threshold`")
     if any(1 < result.runs < _FEW for result in comparison.results):
