@@ -23,6 +23,7 @@ from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.initial import other_network, other_spaces
 from daedalus.learner.run.rollout_length import check_rollout_length
 from daedalus.learner.run.run_state import RunState
+from daedalus.learner.run.settings import unmeasured_target
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.orders import Orders
 from daedalus.learner.target_confirmation import TargetConfirmation
@@ -244,6 +245,8 @@ class LearnerService:
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer", loop: "TrainingLoop") -> Outcome:
         """Train, then write the last metrics row, checkpoint and summary, and let the actors leave."""
         state, server = self._state, self._server
+        if problem := unmeasured_target(self._spec):
+            _logger.warning("%s", problem)
         recorder = Recorder(self._open_writers, self._progress)
         records = RunRecords(state, self._reporter, server.history, server.events, recorder)
         self._reporter.begin(time.monotonic())

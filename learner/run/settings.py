@@ -239,6 +239,18 @@ def run_spec(settings: dict[str, Any]) -> RunSpec:
         raise SettingsError(one_line(error)) from None
 
 
+def unmeasured_target(spec: RunSpec) -> str:
+    """Return why a run without evaluations cannot reach its target, or an empty string."""
+    true_task, target = spec.environment.trains_true_task, spec.training.target_return
+    if true_task or target is None or spec.evaluation.seconds is not None:
+        return ""
+    return (
+        f"training.target_return is {target:g}, but training plays another task (environment.training_kwargs or "
+        "environment.no_reward_limit), whose returns say nothing about the target: set evaluation.seconds, such as 30, "
+        "or training.target_return=none"
+    )
+
+
 def _plain(path: str, value: Any, depth: int = 0) -> Any:
     """Return an argument of a constructor as files and messages express it. Raises SettingsError if they cannot."""
     if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():  # a scalar
