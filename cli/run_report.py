@@ -34,7 +34,7 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
     folder = f"run directory: {run.directory}"
     if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
         folder += f"; draw the curves with: daedalus plot {shlex.quote(str(run.directory))} --output curve.png"
-    return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
+    return "\n".join([trained, *_confirmed(run, summary), evaluated, *evaluation["notes"], folder])
 
 
 def show(text: str, command: str) -> None:
@@ -50,7 +50,7 @@ def show(text: str, command: str) -> None:
             print(f"{command}: {message}", file=sys.stderr)
 
 
-def _confirmed(summary: dict[str, Any]) -> list[str]:
+def _confirmed(run: LocalRun, summary: dict[str, Any]) -> list[str]:
     """Return the line about the new episodes that confirm "solved", if there is one."""
     confirmation = summary.get("confirmation")
     if confirmation is None:
@@ -61,4 +61,6 @@ def _confirmed(summary: dict[str, Any]) -> list[str]:
     )
     if confirmation["interval"] is not None:
         line += ", 95 % interval {} to {}".format(*map(short_number, confirmation["interval"]))
-    return [f"{line}; training mean {short_number(summary['episode_return_mean'])}"]
+    if run.spec.environment.trains_true_task:
+        line += f"; training mean {short_number(summary['episode_return_mean'])}"
+    return [line]

@@ -98,7 +98,14 @@ def add_new_run(options: argparse.ArgumentParser) -> None:
         "--init-from",
         type=Path,
         metavar="RUN_DIR",
-        help="begin with the weights of another run, or of one of its checkpoints. The network must be the same",
+        help="begin with the weights of another run, or of one of its checkpoints. The network and the spaces must be "
+        "the same",
+    )
+    options.add_argument(
+        "--allow-other-spaces",
+        action="store_true",
+        help="accept --init-from of a run whose observations or actions have other names, kinds or bounds: the weights "
+        "are loaded if their shapes fit",
     )
     options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
     add_log(options)

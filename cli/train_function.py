@@ -67,6 +67,7 @@ def train(
     settings: Mapping[str, Any] | None = None,
     wrap: str | None = None,
     init_from: str | Path | None = None,
+    allow_other_spaces: bool = False,
     processes: int = 1,
     callback: Callback | None = None,
     log: str | Sequence[str] = (),
@@ -88,7 +89,8 @@ def train(
       run_dir: a new directory for the run (default: a new folder in runs/).
       settings: any other settings, such as {"training.learning_rate": 0.001}; None unsets one.
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
-      init_from: another run, or one of its checkpoints, whose weights to begin with; the network must be the same.
+      init_from: another run, or one of its checkpoints, whose weights to begin with, of equal network and spaces.
+      allow_other_spaces: accept `init_from` of other spaces: the weights are loaded if their shapes fit.
       processes: of the learner; each computes the gradients of its share of every batch.
       callback: called with each row of metrics; it can log metrics of its own and end training.
       log: trackers to log the run to, of "wandb", "mlflow" and "trackio".
@@ -109,14 +111,16 @@ def train(
     )
     resolved = partial(choice.spec, partial(_assign, changes=settings or {}))
     weights = None if init_from is None else Path(init_from)
-    check_initial(weights)
+    check_initial(weights, other_spaces=allow_other_spaces)
     if run_dir is not None:
         run_directory.check_free(Path(run_dir))  # before the environment is made
     with _checking(quiet):
         spec, spaces = prepare(resolved, env=env, processes=int(processes))
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     with (
-        run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock,
+        run_directory.create_locked(
+            directory, spec, numbered=run_dir is None, init_from=weights, other_spaces=allow_other_spaces
+        ) as lock,
         observed(callback, lock.directory) as (observer, control),
     ):
         run = LocalRun(

@@ -20,8 +20,10 @@ from daedalus.learner.reporting.run_records import RunRecords, load_history
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.heartbeat import Heartbeat
+from daedalus.learner.run.initial import other_network, other_spaces
 from daedalus.learner.run.rollout_length import check_rollout_length
 from daedalus.learner.run.run_state import RunState
+from daedalus.learner.run.settings import unmeasured_target
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.orders import Orders
 from daedalus.learner.target_confirmation import TargetConfirmation
@@ -72,6 +74,7 @@ class LearnerService:
         started: float,
         restored: "Checkpoint | None" = None,
         initial: SavedPolicy | None = None,
+        other_spaces: bool = False,
         spaces: Spaces | None = None,
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
@@ -91,6 +94,7 @@ class LearnerService:
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
           initial: policy of another run whose weights to begin with, unless there is a checkpoint to continue from.
+          other_spaces: whether the spaces of `initial` may be others than those of this run.
           spaces: spaces that all actors must have, if they are known; those of a checkpoint have precedence.
           modules: modules that may be imported for the policy.
           certificate_days_left: function that returns the days until the certificate of this process expires.
@@ -101,6 +105,7 @@ class LearnerService:
         self._spec, self._stop, self._progress = spec, stop, progress
         self._open_writers, self._modules, self._open_ranks = open_writers, modules, open_ranks
         self._restored, self._initial = restored, initial if restored is None else None
+        self._allows_other_spaces = other_spaces
         self._ranks: OtherRanks | None = None  # None: not connected yet
         self._state = RunState(directory, spec, started, certificate_days_left)
         if restored is not None:
@@ -150,7 +155,7 @@ class LearnerService:
             assert spaces is not None
             check_rollout_length(self._spec, spaces)
             learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules, ranks)
-            self._load(learner)
+            self._load(learner, spaces)
             checkpointer, loop = self._training_of(learner, spaces)
             if self._initial is not None:
                 checkpointer.save()  # a learner that is killed before its first checkpoint continues from this one
@@ -183,10 +188,12 @@ class LearnerService:
         ordered = self._orders.stopped
         return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None, ordered=ordered)
 
-    def _load(self, learner: "Learner") -> None:
+    def _load(self, learner: "Learner", spaces: Spaces) -> None:
         """Begin with the weights of a checkpoint or of another run, if any. Raises CheckpointMismatchError."""
         if self._restored is not None:
             policy = self._restored.policy
+            if difference := other_network(policy, self._spec.policy, spaces):
+                raise CheckpointMismatchError(f"{policy.directory}: {difference}")
             learner.restore(policy.policy_version, policy.weights, self._restored.state)
             if learner.learning_rate(self._state.progress) == 0.0:
                 _logger.warning(
@@ -195,11 +202,25 @@ class LearnerService:
                 )
         elif self._initial is not None:
             try:
+                self._check_initial(self._initial, spaces)
                 learner.load(self._initial.weights)
             except CheckpointMismatchError as error:
                 raise CheckpointMismatchError(f"--init-from {self._initial.directory}: {error}") from None
             version, directory = self._initial.policy_version, self._initial.directory
             _logger.info("initial weights: policy version %d of %s", version, directory)
+
+    def _check_initial(self, initial: SavedPolicy, spaces: Spaces) -> None:
+        """Raise CheckpointMismatchError if the policy of another run means something else in this one."""
+        if difference := other_network(initial, self._spec.policy, spaces):
+            raise CheckpointMismatchError(difference)
+        difference = other_spaces(initial, self._spec.environment, spaces)
+        if difference and not self._allows_other_spaces:
+            raise CheckpointMismatchError(
+                f"its policy is for other spaces: {difference}; name a run of the same spaces, or add "
+                "--allow-other-spaces (in Python: allow_other_spaces=True) to load its weights wherever the shapes fit"
+            )
+        if difference:
+            _logger.warning("initial weights of other spaces (--allow-other-spaces): %s", difference)
 
     def _training_of(self, learner: "Learner", spaces: Spaces) -> "tuple[Checkpointer, TrainingLoop]":
         """Publish the policy. Return its checkpointer and its training loop."""
@@ -224,6 +245,8 @@ class LearnerService:
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer", loop: "TrainingLoop") -> Outcome:
         """Train, then write the last metrics row, checkpoint and summary, and let the actors leave."""
         state, server = self._state, self._server
+        if problem := unmeasured_target(self._spec):
+            _logger.warning("%s", problem)
         recorder = Recorder(self._open_writers, self._progress)
         records = RunRecords(state, self._reporter, server.history, server.events, recorder)
         self._reporter.begin(time.monotonic())

@@ -85,7 +85,7 @@ class TrainingLoop:
 
     def _reaches_target(self) -> bool:
         """Return whether the target is reached for the first time, and new episodes confirm it if they are played."""
-        if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._state.spec.training):
+        if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._state.spec):
             return False
         confirmation, version = self._confirmation, self._learner.policy_version
         return confirmation is None or confirmation.confirm(version, self._checkpointer)

@@ -93,6 +93,11 @@ class EnvironmentSpec(Specification):
         named = {"environment.id": self.id, "environment.wrap": self.wrap}
         return {setting: value for setting, value in named.items() if value is not None and ":" in value}
 
+    @property
+    def trains_true_task(self) -> bool:
+        """Whether training plays the task of evaluations, so that the returns of both can be compared."""
+        return self.model_copy(update={"kwargs": self.constructor_kwargs, "training_kwargs": {}}) == self.as_evaluated()
+
     def as_evaluated(self, backend: Backend | None = None) -> "EnvironmentSpec":
         """Return the environment for evaluations: the true task, on another backend if one is named."""
         true_task = {"training_kwargs": {}, "no_reward_limit": None}
@@ -173,8 +178,9 @@ class TrainingSpec(Specification):
     """Budget: env_steps over all actors."""
     target_return: float | None = None
     """The target is reached when the mean return of the last `target_episodes` episodes reaches this value. Where
-    actors explore, it is also reached when the mean return of an evaluation does. `daedalus train` confirms it with as
-    many new episodes."""
+    actors explore, it is also reached when the mean return of an evaluation does; where they play another task than
+    evaluations (`environment.training_kwargs`, `environment.no_reward_limit`), only then. `daedalus train` confirms it
+    with as many new episodes."""
     target_episodes: PositiveInt = 100
     """Number of newest training episodes in the mean return."""
     stop_when_solved: bool = True

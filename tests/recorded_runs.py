@@ -1,8 +1,9 @@
 """Run directories as finished runs leave them, with results of our choice, and without training."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from daedalus.learner.reporting.csv_writer import CsvWriter
@@ -23,9 +24,13 @@ def record(
     evaluation: float | None = 490.0,
     finished: bool = True,
     preset: str = "cartpole",
+    evaluations: Mapping[int, float] = MappingProxyType({}),
     **summary: Any,
 ) -> Path:
-    """Write the directory of a run with one row of metrics for each of `returns`, one minute apart."""
+    """Write the directory of a run with one row of metrics for each of `returns`, one minute apart.
+
+    `evaluations` has mean returns of evaluations by the index of their row.
+    """
     values = read_preset(preset)
     values.pop("for_algorithm", None)
     override(values, [f"training.seed={seed}", *settings])
@@ -36,6 +41,8 @@ def record(
         row |= {"entropy": 1.0, "value_loss": 2.0, "policy_lag_mean": 0.5}
         if mean is not None:
             row |= {"episode_return_mean": mean, "episode_return_std": 5.0}
+        if minute - 1 in evaluations:  # begun 50 env_steps before its result
+            row |= {"evaluation_return_mean": evaluations[minute - 1], "evaluation_env_steps": steps - 50}
         writer.write(row, Details())
     writer.close()
     result = {"finished": finished, "env_steps": env_steps[-1], "solved": False, "seconds_to_target": None}

@@ -151,11 +151,16 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
         ({"preset": "cartpole", "run_dir": "."}, "run directory . is not empty"),
         ({"preset": Path("absent.toml")}, "absent.toml does not exist"),
         ({"preset": "cartpole", "init_from": "nowhere"}, "--init-from: nowhere does not exist"),
+        ({"preset": "cartpole", "allow_other_spaces": True}, "--allow-other-spaces is for the weights of another run"),
+        (
+            {"preset": "cartpole", "settings": {"environment.no_reward_limit": 9}},
+            "training.target_return is 475, but training plays another task",
+        ),
         ({"preset": "cartpole", "log": "tensorboard"}, "log: unknown tracker 'tensorboard': choose from wandb, mlflow"),
         ({"preset": "cartpole", "log": ["wandb", "x"]}, "log: unknown tracker 'x'"),
         (
             {"preset": "cartpole", "settings": {"environment.kwargs.x": np.zeros(2)}},
-            "setting environment.kwargs.x input was not a valid JSON value, not array",
+            "setting environment.kwargs.x is array([0., 0.]), which config.toml and messages to actors cannot",
         ),
     ],
 )

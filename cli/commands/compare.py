@@ -14,7 +14,7 @@ from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\
 Compares finished runs of one environment. Runs with equal settings apart from the seed are one group, which is named
-after the settings that tell the groups apart; or you name the groups, with `--` between them. The table shows the final
+after the settings in which they differ; or you name the groups, with `--` between them. The table shows the final
 return, env_steps and minutes until the mean return of the training episodes reached a threshold, and the probability
 that a run is better than one of the first group. A folder of run directories stands for all of them."""
 

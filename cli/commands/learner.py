@@ -50,7 +50,7 @@ from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
-from daedalus.learner.run.initial import initial_to_resume
+from daedalus.learner.run.initial import allows_other_spaces, initial_to_resume
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
@@ -205,7 +205,12 @@ class _Command:
 
     def _with_directory(self, run: ChosenRun, stack: ExitStack) -> ChosenRun:
         """Create the directory of a new run, and return the run in it; `stack` unlocks it."""
-        new = {"numbered": self.arguments.run_dir is None, "init_from": self.arguments.init_from}
+        arguments = self.arguments
+        new = {
+            "numbered": arguments.run_dir is None,
+            "init_from": arguments.init_from,
+            "other_spaces": arguments.allow_other_spaces,
+        }
         lock = stack.enter_context(run_directory.create_locked(run.directory, run.spec, **new))
         self.context["run"] = run_directory.run_name(lock.directory)
         return replace(run, directory=lock.directory)
@@ -228,6 +233,7 @@ class _Command:
             started=self.started,
             restored=restored,
             initial=initial,
+            other_spaces=self.arguments.allow_other_spaces or allows_other_spaces(run.directory),
             spaces=spaces,
             modules=run.modules,
             certificate_days_left=partial(certificate_days_left, self.credentials),

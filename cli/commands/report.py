@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
@@ -101,5 +102,5 @@ def _read_records(groups: Sequence[Group]) -> tuple[list[Group], dict[Path, RunR
             problems.append(str(error))
     if not records:
         raise RunDataError(problems[0])
-    kept = [Group(name=group.name, runs=[run for run in group.runs if run.directory in records]) for group in groups]
+    kept = [replace(group, runs=[run for run in group.runs if run.directory in records]) for group in groups]
     return [group for group in kept if group.runs], records, [f"left out: {problem}" for problem in problems]

@@ -110,12 +110,18 @@ def train(arguments: list[str]) -> int:
         _check_watching(parsed)
         if parsed.run_dir is not None:
             run_directory.check_free(parsed.run_dir)  # before the environment is made
-        check_initial(parsed.init_from)
+        check_initial(parsed.init_from, other_spaces=parsed.allow_other_spaces)
         spec, spaces = prepare(
             partial(resolve_spec, parsed), env=parsed.env, processes=parsed.processes or 1, fork=True
         )
         directory = parsed.run_dir or named_directory(parsed.preset, spec)
-        lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
+        lock = run_directory.create_locked(
+            directory,
+            spec,
+            numbered=parsed.run_dir is None,
+            init_from=parsed.init_from,
+            other_spaces=parsed.allow_other_spaces,
+        )
     except (RunInUseError, EnvironmentProblemError) as error:
         print_error("train", error)
         return 1

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daedalus.cli.comparing.comparison import final_returns
+from daedalus.cli.comparing.comparison import final_returns, incomparable_returns, training_tasks
 from daedalus.cli.comparing.curves import evaluations, group_curve, points
 from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import RETURN
@@ -41,6 +41,8 @@ def draw_curves(groups: Sequence[Group], output: Path, by: str) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(11, 7), sharex=True, layout="constrained")
     several = any(len(group.runs) > 1 for group in groups)
     band = "band: 95 % interval of the runs" if several else "band: one std; circles: evaluations"
+    if len(training_tasks(groups)) > 1:
+        band += "; different tasks in training"
     for axis, (column, title) in zip(axes.flat, _TITLES.items(), strict=True):
         for group in groups:
             if len(group.runs) > 1:
@@ -63,6 +65,8 @@ def draw_profiles(groups: Sequence[Group], output: Path) -> None:
     plt = _pyplot()
     evaluated = all(run.evaluation is not None for group in groups for run in group.runs)
     returns = [final_returns(group, evaluated=evaluated) for group in groups]
+    if problem := incomparable_returns(groups):
+        raise RunDataError(problem)
     every = np.concatenate(returns)
     every = every[~np.isnan(every)]
     if not len(every):

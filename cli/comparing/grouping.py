@@ -15,7 +15,9 @@ from daedalus.learner.run.run_files import RunDataError
 
 _SERVICE = "service."  # settings of how the learner runs, not of what it learns
 _FIRST = ("training.algorithm", "collection.upload", "collection.rollout_length")  # the names that say most
-_MOST_NAMED = 3  # settings in the name of a group, if they are enough
+_MOST_TELLING = 3  # settings that are looked for, of the fewest that tell groups apart
+_MOST_NAMED = 4  # settings in the name of a group, if they are enough
+_LONGEST_VALUE = 24  # characters of a value in a name, if different values stay different
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,6 +26,7 @@ class Group:
 
     name: str
     runs: Sequence[RecordedRun]
+    unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in the name
 
 
 def check_comparable(runs: Sequence[RecordedRun]) -> None:
@@ -45,21 +48,22 @@ def by_settings(runs: Sequence[RecordedRun], keys: Sequence[str] = ()) -> list[G
 
     Args:
       runs: the runs; one without settings is a group of its own.
-      keys: settings that name the groups (default: the fewest that tell them apart).
+      keys: settings that name the groups (default: those in which the groups differ).
     """
     parts: dict[str, list[RecordedRun]] = {}
     for run in runs:
         parts.setdefault(_identity(run, keys), []).append(run)
     groups = list(parts.values())
-    chosen = list(keys) or _telling(groups)
+    differing = _differing(groups)
+    chosen = list(keys) or differing
     if chosen:
         groups.sort(key=lambda group: [_sortable(group[0].setting(key)) for key in chosen])
-    return _named(groups, chosen)
+    return _named(groups, differing, keys)
 
 
 def by_user(parts: Sequence[Sequence[RecordedRun]]) -> list[Group]:
-    """Return groups that a user put together, in their order, named by the settings that tell them apart, if any do."""
-    return _named(parts, _telling(parts))
+    """Return groups that a user put together, in their order, named by the settings that differ, if any do."""
+    return _named(parts, _differing(parts))
 
 
 def _identity(run: RecordedRun, keys: Sequence[str] = ()) -> str:
@@ -74,25 +78,56 @@ def _is_relevant(key: str) -> bool:
     return key != SEED and not key.startswith(_SERVICE)
 
 
-def _telling(groups: Sequence[Sequence[RecordedRun]]) -> list[str]:
-    """Return the fewest settings that are equal within each group and that tell all groups apart; empty if none do."""
-    if len(groups) < 2 or not all(run.settings for group in groups for run in group):
+def _differing(groups: Sequence[Sequence[RecordedRun]]) -> list[str]:
+    """Return the settings in which groups differ; first the fewest that tell all groups apart, if a few do."""
+    runs = [run for group in groups for run in group]
+    if len(groups) < 2 or not all(run.settings for run in runs):
         return []
-    known = sorted({key for group in groups for run in group for key in run.settings if _is_relevant(key)})
-    constant = [key for key in known if all(len({_text(run, key) for run in group}) == 1 for group in groups)]
-    differing = [key for key in constant if len({_text(group[0], key) for group in groups}) > 1]
+    known = {part for run in runs for key in run.settings if _is_relevant(key) for part in _parts(key, runs)}
+    differing = [key for key in known if len({_text(group, key) for group in groups}) > 1]
     differing.sort(key=lambda key: (_FIRST.index(key) if key in _FIRST else len(_FIRST), key))
-    for count in range(1, _MOST_NAMED + 1):
+    for count in range(1, _MOST_TELLING + 1):
         for keys in itertools.combinations(differing, count):
-            if len({tuple(_text(group[0], key) for key in keys) for group in groups}) == len(groups):
-                return list(keys)
-    tell = len({tuple(_text(group[0], key) for key in differing) for group in groups}) == len(groups)
-    return differing if tell else []
+            if len({tuple(_text(group, key) for key in keys) for group in groups}) == len(groups):
+                return [*keys, *(key for key in differing if key not in keys)]
+    return differing
 
 
-def _named(groups: Sequence[Sequence[RecordedRun]], keys: Sequence[str]) -> list[Group]:
-    names = [", ".join(f"{short(key, keys)}={_text(group[0], key)}" for key in keys) for group in groups]
-    return [Group(name=name or _own_name(group), runs=group) for name, group in zip(names, groups, strict=True)]
+def _parts(key: str, runs: Sequence[RecordedRun]) -> list[str]:
+    """Return a setting, or its parts if it is a table in all runs."""
+    values = [run.settings.get(key) or {} for run in runs]
+    names = {name for value in values if isinstance(value, dict) for name in value}
+    if not all(isinstance(value, dict) for value in values) or any("." in name for name in names):
+        return [key]
+    return [f"{key}.{name}" for name in names]
+
+
+def _named(
+    groups: Sequence[Sequence[RecordedRun]], differing: Sequence[str], chosen: Sequence[str] = ()
+) -> list[Group]:
+    """Return groups with names: of the chosen settings, or else of the first of those that differ."""
+    names, keys = [""] * len(groups), list[str]()
+    for tried in [chosen] if chosen else (differing[:_MOST_NAMED], differing):
+        columns = [_shortened([_text(group, key) for group in groups]) for key in tried]
+        rows = [
+            ", ".join(f"{short(key, tried)}={value}" for key, value in zip(tried, row, strict=True))
+            for row in zip(*columns, strict=True)
+        ]
+        if chosen or len(set(rows)) == len(groups):
+            names, keys = rows, list(tried)
+            break
+    unnamed = [key for key in differing if key not in keys]
+    more = f", +{len(unnamed)} more" if unnamed and not chosen else ""
+    return [
+        Group(name=f"{name}{more}" if name else _own_name(group), runs=group, unnamed=unnamed)
+        for name, group in zip(names, groups, strict=True)
+    ]
+
+
+def _shortened(values: Sequence[str]) -> Sequence[str]:
+    """Return the values of the groups, shortened if different ones stay different."""
+    cut = [value if len(value) <= _LONGEST_VALUE else f"{value[: _LONGEST_VALUE - 3]}..." for value in values]
+    return cut if len(set(cut)) == len(set(values)) else values
 
 
 def short(key: str, keys: Sequence[str]) -> str:
@@ -111,8 +146,9 @@ def _own_name(group: Sequence[RecordedRun]) -> str:
     return group[0].directory.resolve().name
 
 
-def _text(run: RecordedRun, key: str) -> str:
-    return text(run.setting(key))
+def _text(group: Sequence[RecordedRun], key: str) -> str:
+    """Return the values of a setting in a group."""
+    return "/".join(sorted({text(run.setting(key)) for run in group}))
 
 
 def text(value: Any) -> str:

@@ -10,14 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
 from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
+from daedalus.protocol.spec import EnvironmentSpec
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
+EVALUATION = "evaluation_return_mean"  # during training
 
 # Numbers that are computed with. Files of other releases, or that somebody changed, may have other values.
 _NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
@@ -36,11 +39,18 @@ class RecordedRun:
     summary: Mapping[str, Any]  # summary.json; empty before the end of training
 
     def setting(self, path: str) -> Any:
-        """Return a setting, or the part of one that is a table, such as `environment.kwargs.size`; None if unset."""
+        """Return a setting, or the part of one that is a table, such as `environment.kwargs.size`; None if unset.
+
+        A part that is None is "none".
+        """
         section, *keys = path.split(".")
         value = self.settings.get(".".join((section, *keys[:1])))
         for key in keys[1:]:
-            value = value.get(key) if isinstance(value, Mapping) else None
+            value = (
+                (value[key] if value[key] is not None else "none")
+                if isinstance(value, Mapping) and key in value
+                else None
+            )
         return value
 
     @property
@@ -75,10 +85,27 @@ class RecordedRun:
         """The target return of the run, or None."""
         return self.settings.get("training.target_return")
 
-    def reached(self, threshold: float) -> tuple[float, float]:
+    @property
+    def environment(self) -> EnvironmentSpec | None:
+        """Settings of the environment; None if this release does not know them."""
+        values = {
+            key.partition(".")[2]: value for key, value in self.settings.items() if key.startswith("environment.")
+        }
+        try:
+            return EnvironmentSpec.model_validate(values)
+        except ValidationError:
+            return None
+
+    @property
+    def trains_true_task(self) -> bool:
+        """Whether its training returns can be compared with those of evaluations."""
+        return self.environment is None or self.environment.trains_true_task
+
+    def reached(self, threshold: float, *, evaluated: bool = False) -> tuple[float, float]:
         """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.
 
-        Infinite if the mean did not reach the threshold. Rows that a resumed run repeated, from its checkpoint on,
+        `evaluated` takes the mean returns of evaluations during training; NaN if there was none. Infinite if the mean
+        did not reach the threshold. Rows that a resumed run repeated, from its checkpoint on,
         replace the earlier ones. The precision is that of the rows of metrics.csv, except for the target of a run that
         stopped at it. The metrics need wall_seconds.
         """
@@ -86,14 +113,19 @@ class RecordedRun:
         steps, seconds = self.summary.get("env_steps"), self.summary.get("seconds_to_target")
         if at_target and self.settings.get("training.stop_when_solved") and steps is not None and seconds is not None:
             return float(steps), seconds / 60.0
-        above = (self.metrics[RETURN] >= threshold) & not_repeated(self.metrics[ENV_STEPS])
+        newest = not_repeated(self.metrics[ENV_STEPS])
+        returns = self.metrics.get(EVALUATION, np.full(len(newest), np.nan)) if evaluated else self.metrics[RETURN]
+        if evaluated and np.isnan(returns).all():
+            return math.nan, math.nan
+        above = (returns >= threshold) & newest
         episodes = self.metrics.get("episodes")
-        if episodes is not None:  # the mean of fewer episodes may be luck
+        if episodes is not None and not evaluated:  # the mean of fewer episodes may be luck
             above &= episodes >= self.settings.get("training.target_episodes", 1)
         if not above.any():
             return math.inf, math.inf
         row = int(above.argmax())
-        return float(self.metrics[ENV_STEPS][row]), float(self.metrics[SECONDS][row]) / 60.0
+        at = self.metrics.get("evaluation_env_steps", self.metrics[ENV_STEPS]) if evaluated else self.metrics[ENV_STEPS]
+        return float(at[row]), float(self.metrics[SECONDS][row]) / 60.0
 
 
 def find_runs(paths: Iterable[Path]) -> list[Path]:

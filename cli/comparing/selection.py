@@ -21,7 +21,7 @@ def select(
       parts: paths of run directories or of folders of them. One part is grouped by settings; several parts are groups.
       finished: leave out unfinished runs.
       columns: columns of the metrics that are needed.
-      keys: settings that name the groups, if there is one part (default: the fewest that tell them apart).
+      keys: settings that name the groups, if there is one part (default: those that differ).
 
     Raises RunDataError if a path is no run directory, no run is left, or the runs play different environments.
     """

@@ -39,7 +39,7 @@ def cells(result: GroupResult, comparison: Comparison) -> list[str]:
     """Return the cells of one group, one for each name of `header`."""
     texts = [result.group, str(result.runs), written(result.final_return, short_number)]
     if result.env_steps is not None and result.minutes is not None:
-        texts.append(f"{result.reached} of {result.runs}")
+        texts.append("-" if result.reached is None else f"{result.reached} of {result.runs}")
         texts += [written(result.env_steps, lambda value: f"{value:,.0f}"), written(result.minutes, short_number)]
     if len(comparison.results) > 1:
         improvement = result.improvement
@@ -59,6 +59,15 @@ def notes(comparison: Comparison) -> list[str]:
             "P(> first): probability that a run has a higher final return than one of the first group; "
             "0.5 if they are equal"
         )
+    if comparison.incomparable:
+        lines.append(comparison.incomparable)
+    if comparison.other_task and comparison.threshold is not None:
+        lines.append(
+            "reached, env_steps and minutes: by evaluations during training (evaluation.seconds; -: there were none), "
+            "because training plays another task (environment.training_kwargs or environment.no_reward_limit)"
+        )
+    if comparison.unnamed:
+        lines.append(f"the groups also differ in {', '.join(comparison.unnamed)}")
     if comparison.threshold is None:
         lines.append("env_steps and minutes to a return: name the return with `daedalus compare --threshold`")
     if any(1 < result.runs < _FEW for result in comparison.results):

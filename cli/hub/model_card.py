@@ -153,7 +153,11 @@ def _settings(record: RunRecord) -> str:
 
 
 def _versions(record: RunRecord) -> str:
-    rows = [(name, value) for name, value in record.versions.items() if name not in ("init_from", "processors")]
+    rows = [
+        (name, value)
+        for name, value in record.versions.items()
+        if name not in ("init_from", "init_from_other_spaces", "processors")
+    ]
     if not rows:
         return ""
     return f"<details><summary>Versions</summary>\n\n{_table(('package', 'version'), rows)}\n\n</details>"

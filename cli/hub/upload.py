@@ -86,7 +86,8 @@ def policy_files(record: RunRecord, policy: SavedPolicy, repository: str) -> dic
     files |= _texts(record.run.directory, (CONFIG, METRICS))
     if record.evaluation is not None:
         files[EVALUATION] = _json(record.evaluation.model_dump(mode="json"))
-    files[VERSIONS] = _json({name: value for name, value in record.versions.items() if name != "init_from"})  # a path
+    own = {name: value for name, value in record.versions.items() if not name.startswith("init_from")}  # a path
+    files[VERSIONS] = _json(own)
     files[CARD] = model_card(record, policy.spec, repository, video).encode()
     return files
 

@@ -1,6 +1,7 @@
 """The sections of a report about several runs. Pure functions."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from daedalus.cli.comparing.comparison import Comparison, compare_groups
@@ -17,7 +18,7 @@ Records = Mapping[Path, RunRecord]  # by run directory
 
 def comparison_of(groups: Sequence[Group], threshold: float | None) -> Comparison | None:
     """Return the comparison of the finished runs, or None if no run has finished."""
-    finished = [Group(name=group.name, runs=[run for run in group.runs if not run.unfinished]) for group in groups]
+    finished = [replace(group, runs=[run for run in group.runs if not run.unfinished]) for group in groups]
     finished = [group for group in finished if group.runs]
     return compare_groups(finished, threshold) if finished else None
 
@@ -70,17 +71,17 @@ def _evaluated(record: RunRecord) -> str:
 
 def differences_section(groups: Sequence[Group]) -> Html | None:
     """Return the settings in which the groups differ, or None if there are none."""
-    firsts = [group.runs[0].settings for group in groups]
-    known = sorted({key for settings in firsts for key in settings} - {"training.seed"})
-    rows = [
-        (key, *(setting_text(settings.get(key)) for settings in firsts))
-        for key in known
-        if len({setting_text(settings.get(key)) for settings in firsts}) > 1
-    ]
+    known = sorted({key for group in groups for run in group.runs for key in run.settings} - {"training.seed"})
+    rows = [(key, *(_values(group, key) for group in groups)) for key in known]
+    rows = [row for row in rows if len(set(row[1:])) > 1]
     if not rows:
         return None
     head = ("setting", *(group.name for group in groups))
     return section("Settings that differ", table(head, rows, label="settings that differ"))
+
+
+def _values(group: Group, key: str) -> str:
+    return " / ".join(sorted({setting_text(run.settings.get(key)) for run in group.runs}))
 
 
 def versions_section(groups: Sequence[Group], records: Records) -> Html | None:
@@ -89,7 +90,7 @@ def versions_section(groups: Sequence[Group], records: Records) -> Html | None:
     for group in groups:
         for run in group.runs:
             record = records[run.directory]
-            shown = {name: value for name, value in record.versions.items() if name != "init_from"}
+            shown = {name: value for name, value in record.versions.items() if not name.startswith("init_from")}
             if shown:
                 columns.setdefault(tuple(sorted(shown.items())), []).append(record.name)
     if not columns:

@@ -8,7 +8,7 @@ from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.evaluation_processes import play, without_episodes
 from daedalus.cli.running.child_arguments import evaluation_arguments
 from daedalus.cli.running.local_run import LocalRun
-from daedalus.cli.running.sampled_evaluation import is_below_training, sampled_note
+from daedalus.cli.running.sampled_evaluation import is_below_training, other_task_note, sampled_note
 from daedalus.cli.running.select_best import select_best
 from daedalus.learner.run import run_directory
 
@@ -17,7 +17,8 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
     If greedy episodes are clearly worse than training was, the same episodes are played with sampled actions, too,
-    unless the policy is greedy anyway, or sampled episodes have confirmed the target. Raises EvaluationFailedError.
+    unless the policy is greedy anyway, or sampled episodes have confirmed the target. A note says where training
+    plays another task, whose returns say nothing about these. Raises EvaluationFailedError.
     """
     began = time.monotonic()
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
@@ -26,7 +27,10 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
     (evaluation,) = play([[str(run.directory), *options]], stopping, output)
     confirmed = summary.get("confirmation") is not None  # by sampled episodes
     can_differ = run.spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
-    if not confirmed and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
+    true_task = run.spec.environment.trains_true_task
+    if not true_task and summary.get("episode_return_mean") is not None:
+        evaluation["notes"].append(other_task_note(summary["episode_return_mean"]))
+    if true_task and not confirmed and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
         (sampled,) = play([[str(run.directory), *options, "--actions", "sampled"]], stopping, output)
         evaluation["notes"].append(sampled_note(evaluation, sampled))
         summary["sampled_evaluation"] = without_episodes(sampled)

@@ -6,6 +6,7 @@ from typing import Any
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.quick_check import checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.settings_arguments import check_processes
+from daedalus.learner.run.settings import SettingsError, unmeasured_target
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -34,4 +35,6 @@ def prepare(
         chosen = resolve(defaults)
         spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
         check_processes(processes, spec)
+    if problem := unmeasured_target(spec):
+        raise SettingsError(problem)
     return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces

@@ -32,5 +32,13 @@ def sampled_note(greedy: dict[str, Any], sampled: dict[str, Any]) -> str:
     return text
 
 
+def other_task_note(training_mean: float) -> str:
+    """Return a message about the mean return of training episodes of another task than that of evaluations."""
+    return (
+        f"the return {short_number(training_mean)} of training is that of another task (environment.training_kwargs or "
+        "environment.no_reward_limit): it cannot be compared with evaluations"
+    )
+
+
 def _error(evaluation: dict[str, Any]) -> float:
     return evaluation["return_std"] / math.sqrt(evaluation["episodes"])

@@ -2,11 +2,9 @@
 
 import math
 import re
-import tomllib
 from dataclasses import dataclass
-from typing import Any
 
-from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.run.settings import SettingsError, read_value
 from daedalus.protocol.spec import RunSpec
 
 _LOG_FACTOR = 10.0  # a range that spans more is sampled on a logarithmic scale
@@ -70,7 +68,10 @@ def read_axis(text: str) -> Axis:
     values = split_values(rest)
     if "" in values:
         raise SettingsError(f"--over {text}: a value is empty: remove the comma, or write a value")
-    parsed = [_parsed(value) for value in values]
+    try:
+        parsed = [(type(read), read) for read in (read_value(key, value) for value in values)]
+    except SettingsError as error:
+        raise SettingsError(f"--over {text}: {error}") from None
     twice = next((value for index, value in enumerate(values) if parsed[index] in parsed[:index]), None)
     if twice is not None:
         raise SettingsError(f"--over {text}: the value {twice} is there twice: remove one")
@@ -92,11 +93,3 @@ def split_values(text: str) -> list[str]:
         else:
             parts[-1] += character
     return [part.strip() for part in parts]
-
-
-def _parsed(value: str) -> tuple[str, Any]:
-    try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        parsed = value
-    return type(parsed).__name__, parsed

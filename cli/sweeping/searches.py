@@ -164,7 +164,8 @@ def score(run: PlannedRun) -> float:
     """Return what a sampler maximises: the return of the final evaluation.
 
     Runs that stop at a target return are ranked by their env_steps instead, in shares of the budget: 1 - share. Those
-    that miss the target rank below all of them, by their return.
+    that miss the target rank below all of them, by the return of training, or that of the final evaluation where
+    training plays another task.
     """
     summary = read_json(run.directory / SUMMARY)
     training = run.spec.training
@@ -173,7 +174,8 @@ def score(run: PlannedRun) -> float:
         return final
     if summary["solved"]:
         return 1.0 - summary["env_steps"] / training.env_steps
-    mean = final if summary["episode_return_mean"] is None else summary["episode_return_mean"]
+    trained = summary["episode_return_mean"] if run.spec.environment.trains_true_task else None
+    mean = final if trained is None else trained
     return -max(training.target_return - mean, 0.0) / max(abs(training.target_return), 1.0)
 
 

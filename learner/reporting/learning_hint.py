@@ -7,15 +7,16 @@ _BASELINE_EPISODES = 20  # after so many, the policy is still about as random as
 _BASELINE_PROGRESS = 0.05  # unless they took more than this share of the budget
 _JUDGED_PROGRESS, _WATCHED_PROGRESS = 0.2, 0.1  # shares of the budget: of the judgement, and of the rows that count
 _LEAST_ROWS = 5
+_BETTER = 0.25  # standard deviations of the first episodes by which a mean return is better
 _COLLAPSED = 0.1  # of the first entropy
 
 
 class LearningHint:
     """Judge of a run after a fifth of its budget, by its metrics rows.
 
-    A run does not learn where all returns are equal, where the mean return is still that of its first episodes and the
-    entropy has collapsed, or where the explained variance stayed below 0. Runs that were resumed after the first
-    episodes are not judged.
+    A run has nothing to learn from where all returns are equal. It does not learn where the entropy has collapsed or
+    the explained variance stayed below 0, unless the mean return is higher than that of the first episodes, or the
+    newest evaluation better than the first. Runs that were resumed after the first episodes are not judged.
     """
 
     def __init__(self, budget: int, *, normalizes_rewards: bool) -> None:
@@ -24,6 +25,7 @@ class LearningHint:
         self._first_return: tuple[float, float] | None = None  # mean and standard deviation
         self._first_entropy: float | None = None
         self._explained: list[float] = []
+        self._evaluations: list[tuple[float, float]] = []  # as _first_return; the first and the newest
         self._lowest, self._highest = math.inf, -math.inf  # returns in all rows
         self._judged = False
         self._due = ""
@@ -44,6 +46,9 @@ class LearningHint:
                 self._judged = True
                 return
             self._first_return = row["episode_return_mean"], row["episode_return_std"]
+        if "evaluation_return_mean" in row:
+            newest = row["evaluation_return_mean"], row.get("evaluation_return_std", 0.0)
+            self._evaluations = [*(self._evaluations[:1] or [newest]), newest]
         if progress >= _WATCHED_PROGRESS and "explained_variance" in row:
             self._explained.append(row["explained_variance"])
         if progress >= _JUDGED_PROGRESS and has_returns:
@@ -58,24 +63,27 @@ class LearningHint:
     def _judgement(self, row: Mapping[str, float]) -> str:
         if self._first_return is None:
             return ""
-        mean, deviation = self._first_return
+        trained = self._first_return, (row["episode_return_mean"], 0.0)
+        for (before, deviation), *_, (now, _) in (trained, self._evaluations or trained):
+            if now > before + _BETTER * deviation:
+                return ""
         if self._lowest == self._highest:
             return (
-                f"this run does not learn: every episode so far has the return {self._lowest:.4g}, so that no "
-                "action was better than another; check the reward, and whether random actions can reach the goal"
+                f"this run has nothing to learn from: every episode so far has the return {self._lowest:.4g}, so that "
+                "no action was better than another; check the reward, and whether random actions can reach the goal"
             )
         first, entropy = self._first_entropy or 0.0, row.get("entropy", 0.0)
-        no_better = row["episode_return_mean"] <= mean + 0.25 * deviation
-        if no_better and first > 0.0 and entropy < _COLLAPSED * first:
+        returns = f"after a fifth of the budget the mean return is {row['episode_return_mean']:.4g}"
+        returns += f", and was {self._first_return[0]:.4g} at the start"
+        if first > 0.0 and entropy < _COLLAPSED * first:
             return (
-                f"this run does not learn: after a fifth of the budget the mean return is {mean:.4g} as at the start, "
-                f"and the entropy fell from {first:.3g} to {entropy:.3g}, so the policy explores no more; try a larger "
-                "training.entropy_bonus or a smaller training.learning_rate"
+                f"this run does not learn: {returns}, and the entropy fell from {first:.3g} to {entropy:.3g}, so the "
+                "policy explores no more; try a larger training.entropy_bonus or a smaller training.learning_rate"
             )
         if len(self._explained) >= _LEAST_ROWS and max(self._explained) < 0.0:
             normalize = "" if self._normalizes_rewards else "training.normalize_rewards=true or "
             return (
-                "this run does not learn: the explained variance of the value stays below 0; "
+                f"this run does not learn: {returns}, and the explained variance of the value stays below 0; "
                 f"try {normalize}a smaller training.learning_rate"
             )
         return ""

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
 from daedalus.learner.run.annealing import Annealing
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Upload
 
 _SAVED = (
@@ -126,12 +126,16 @@ class RunCounters:
         mean = self.episode_return_mean
         return target is not None and mean is not None and len(self.returns) == self.target_episodes and mean >= target
 
-    def is_solved(self, training: TrainingSpec) -> bool:
-        """Return whether the target was reached: also by an evaluation, where actors explore and do worse."""
-        target, best = training.target_return, self.best_evaluation
-        if training.explores and target is not None and best is not None and best >= target:
-            return True
-        return self.reached(target)
+    def is_solved(self, spec: RunSpec) -> bool:
+        """Return whether the target was reached.
+
+        Where actors explore and do worse, also by an evaluation; only by one where training plays another task.
+        """
+        target, best = spec.training.target_return, self.best_evaluation
+        evaluated = target is not None and best is not None and best >= target
+        if not spec.environment.trains_true_task:
+            return evaluated
+        return (spec.training.explores and evaluated) or self.reached(target)
 
     def forget_returns(self) -> None:
         """Forget the newest episodes and the best evaluation, so that the target has to be reached again."""

@@ -33,7 +33,7 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
     if counters is None or summary.get("env_steps") != counters.env_steps:
         return None
     training = spec.training
-    solved = counters.is_solved(training) and bool(summary.get("solved"))  # not while new episodes have to confirm it
+    solved = counters.is_solved(spec) and bool(summary.get("solved"))  # not while new episodes have to confirm it
     if solved and training.stop_when_solved:
         reason = (
             f"the target return {training.target_return:g} was reached, and {counters.env_steps:,} env_steps are done: "

@@ -29,7 +29,7 @@ import tomli_w
 from daedalus.learner.run import run_files
 from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
-from daedalus.learner.run.settings import SettingsError, read_settings, run_spec
+from daedalus.learner.run.settings import SettingsError, as_toml, read_settings, run_spec
 from daedalus.policy.saving.replacing import replace_text
 from daedalus.protocol import keys
 from daedalus.protocol.spec import RunSpec
@@ -100,7 +100,14 @@ def create(directory: Path, spec: RunSpec) -> None:
     create_locked(directory, spec).close()
 
 
-def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, init_from: Path | None = None) -> RunLock:
+def create_locked(
+    directory: Path,
+    spec: RunSpec,
+    *,
+    numbered: bool = False,
+    init_from: Path | None = None,
+    other_spaces: bool = False,
+) -> RunLock:
     """Create the directory of a new run, with config.toml and versions.json, and return its lock.
 
     Args:
@@ -108,6 +115,7 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
       spec: the settings of the run.
       numbered: add a number to the name if the directory exists; the lock has the resulting path.
       init_from: run whose weights the new run begins with, for versions.json, with its absolute path.
+      other_spaces: whether its spaces may be others, for versions.json.
 
     Raises SettingsError if the directory is not empty, locked, or cannot be created.
     """
@@ -120,7 +128,9 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
         try:
             check_free(directory)  # another process may have held the lock before
             write_config(directory, spec)
-            origin = {} if init_from is None else {"init_from": os.path.abspath(init_from)}
+            origin: dict[str, Any] = {} if init_from is None else {"init_from": os.path.abspath(init_from)}
+            if other_spaces:
+                origin["init_from_other_spaces"] = True
             write_json(directory / VERSIONS, {**_versions(), **origin})
         except BaseException:
             lock.close()
@@ -169,7 +179,7 @@ def remove_failed(directory: Path) -> None:
 def write_config(directory: Path, spec: RunSpec) -> None:
     """Write config.toml: all settings, including defaults; unset settings are omitted. Raises SettingsError."""
     derived = {"training": {"algorithm_record"}}  # it is read from the class of the algorithm again
-    text = tomli_w.dumps(spec.model_dump(mode="json", exclude_none=True, exclude=derived))
+    text = tomli_w.dumps(as_toml(spec.model_dump(mode="json", exclude_none=True, exclude=derived)))
     try:
         replace_text(directory / CONFIG, text)
     except OSError as error:

@@ -1,20 +1,38 @@
 """Presets, TOML files and `--set` assignments -> a validated RunSpec. Every error message is one line."""
 
+import ast
+import datetime
 import difflib
 import importlib.resources
+import json
+import math
 import re
 import shlex
 import tomllib
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import JsonValue, ValidationError
 
 from daedalus.learner.run.run_files import RunDataError, read_toml
 from daedalus.learner.run.setting_errors import known_names, one_line, unknown_setting
 from daedalus.protocol.algorithms import check_algorithm
 from daedalus.protocol.spec import RunSpec, TrainingSpec
+
+# Tables of arguments: their values have no type that would refuse a wrong one.
+_TABLES = {
+    (section, name)
+    for section, sections in RunSpec.model_fields.items()
+    for name, field in getattr(sections.annotation, "model_fields", {}).items()
+    if field.annotation == dict[str, JsonValue]
+}
+_NONE = "none"  # {none = true} stands for None in a table of arguments: TOML has no null value
+_WORDS = {"true": "true", "yes": "true", "on": "true", "false": "false", "no": "false", "off": "false"} | dict.fromkeys(
+    ("none", "null", "nil"), _NONE
+)  # that mean a value elsewhere, in any case
+_MOST_NESTED = 64
 
 
 class SettingsError(Exception):
@@ -73,7 +91,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
-    """Apply `section.key=value` assignments in place. A value that is not valid TOML is a plain string.
+    """Apply `section.key=value` assignments in place. See read_value for the value.
 
     Raises SettingsError for an assignment that is not of this form.
     """
@@ -82,17 +100,76 @@ def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
         if not equals or "." not in path:
             raise SettingsError(f"--set {assignment}: write section.key=value, such as training.learning_rate=0.001")
         try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text
-        try:
-            assign(settings, path, value)
+            assign(settings, path, read_value(path, text))
         except SettingsError as error:
             raise SettingsError(f"--set {assignment}: {error}") from None
 
 
+def read_value(path: str, text: str) -> Any:
+    """Return the value that a text means for a setting: TOML, a literal of Python or JSON, `none`, or plain text.
+
+    The constructor of an environment or an algorithm takes any text, so that a text that looks like a value, and is
+    none, is refused for its arguments. Raises SettingsError.
+    """
+    values = _literals(text)
+    if len(values) == 1 and not text.rstrip().endswith(","):
+        moment = isinstance(values[0], datetime.date | datetime.time)  # a text needs no quotes
+        return text.strip() if moment else values[0]
+    if text.strip() == _NONE:
+        return None
+    if _in_table(path):
+        _check_plain_text(text, values)
+    return text
+
+
+def _literals(text: str) -> list[Any]:
+    """Return the values that a text has with commas between them; empty if it is plain text."""
+    listed = f"[{text}]"  # a comment would hide the bracket
+    readers = (lambda: tomllib.loads(f"value = {listed}"), lambda: {"value": ast.literal_eval(listed)})
+    for reader in (*readers, lambda: {"value": json.loads(listed)}):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # such as for an escape that Python does not know
+                read = reader()
+        except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError, Warning):
+            continue
+        if read.keys() == {"value"} and read["value"] != [...]:
+            return read["value"]
+    return []
+
+
+def _check_plain_text(text: str, values: Sequence[Any]) -> None:
+    """Raise SettingsError if a text for an argument was probably meant as another value."""
+    bare = text.strip()
+    quoted = f"{shlex.quote(json.dumps(bare, ensure_ascii=False))} for the text"
+    if values:
+        raise SettingsError(f"{bare} is several values: write [{bare}] for a list, or {quoted}")
+    if meant := _WORDS.get(bare.casefold()):
+        raise SettingsError(f"{bare} would be a text: write {meant}, or {quoted}")
+    if bare.startswith(("[", "{", "(", '"', "'")):
+        raise SettingsError(
+            f'{bare} is neither TOML nor a literal of Python: write it as [8, true, "text"] or '
+            '{size = 8, mode = "text"}, in quotation marks for the shell'
+        )
+    try:
+        number = float(bare.replace("_", ""))
+    except ValueError:
+        return
+    raise SettingsError(
+        f"{bare} would be a text: write {f'{number:.15g}, or ' if math.isfinite(number) else ''}{quoted}"
+    )
+
+
+def _in_table(path: str) -> bool:
+    """Return whether a path leads to a table of arguments, or into one."""
+    return tuple(path.strip().split(".")[:2]) in _TABLES
+
+
 def assign(settings: dict[str, Any], path: str, value: Any) -> None:
-    """Set `section.key` to a value in place; None and "none" unset it. Raises SettingsError for an invalid path."""
+    """Set `section.key` to a value in place. Raises SettingsError for an invalid path.
+
+    None and "none" unset a setting. An argument in a table, such as `environment.kwargs.size`, has any value.
+    """
     *sections, key = path.strip().split(".")
     if not sections:
         raise SettingsError(f"{path!r} has no section: write section.key, such as training.learning_rate")
@@ -101,7 +178,10 @@ def assign(settings: dict[str, Any], path: str, value: Any) -> None:
         section = section.setdefault(name, {})
         if not isinstance(section, dict):
             raise SettingsError(f"{name} is a value, not a section: remove the part after {name}")
-    _assign(section, key, value)
+    if len(sections) > 1 and _in_table(path):
+        section[key] = value
+    else:
+        _assign(section, key, value)
 
 
 def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
@@ -147,7 +227,72 @@ def _assign(section: dict[str, Any], key: str, value: Any) -> None:
 
 def run_spec(settings: dict[str, Any]) -> RunSpec:
     """Return the validated specification. Raises SettingsError, which names the first invalid setting."""
+    plain = dict(settings)
+    for section, name in sorted(_TABLES):
+        values = plain.get(section)
+        if isinstance(values, dict) and isinstance(values.get(name), dict):
+            arguments = {key: _plain(f"{section}.{name}.{key}", value) for key, value in values[name].items()}
+            plain[section] = {**values, name: arguments}
     try:
-        return RunSpec.model_validate(settings)
+        return RunSpec.model_validate(plain)
     except ValidationError as error:
         raise SettingsError(one_line(error)) from None
+
+
+def unmeasured_target(spec: RunSpec) -> str:
+    """Return why a run without evaluations cannot reach its target, or an empty string."""
+    true_task, target = spec.environment.trains_true_task, spec.training.target_return
+    if true_task or target is None or spec.evaluation.seconds is not None:
+        return ""
+    return (
+        f"training.target_return is {target:g}, but training plays another task (environment.training_kwargs or "
+        "environment.no_reward_limit), whose returns say nothing about the target: set evaluation.seconds, such as 30, "
+        "or training.target_return=none"
+    )
+
+
+def _plain(path: str, value: Any, depth: int = 0) -> Any:
+    """Return an argument of a constructor as files and messages express it. Raises SettingsError if they cannot."""
+    if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():  # a scalar
+        value = value.item()
+    if depth > _MOST_NESTED:
+        raise SettingsError(f"setting {path[:200]} is nested too deeply")
+    if isinstance(value, list):
+        return [_plain(f"{path}.{index}", part, depth + 1) for index, part in enumerate(value)]
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        if value.keys() == {_NONE} and value[_NONE] is True:
+            return None
+        return {key: _plain(f"{path}.{key}", part, depth + 1) for key, part in value.items()}
+    if value is None or isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    shown = " ".join(repr(value).split())
+    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
+    raise SettingsError(
+        f"setting {path} is {shown}, which config.toml and messages to actors cannot express: {_instead(value)}"
+    )
+
+
+def _instead(value: Any) -> str:
+    """Return how to write a value that is none of JSON's."""
+    if isinstance(value, tuple | set | frozenset):
+        return f"write a list, {list(value)}"
+    if isinstance(value, datetime.date | datetime.time):
+        return f'write a text, "{value.isoformat()}"'
+    if isinstance(value, Path):
+        return f'write a text, "{value}"'
+    if hasattr(value, "tolist"):
+        return "write a list, as by its method tolist()"
+    if isinstance(value, dict):
+        return "write its keys as texts"
+    if isinstance(value, float):
+        return "write a finite number, or a text that the constructor reads"
+    return "write a number, a text in quotation marks, true, false, a list or a table"
+
+
+def as_toml(values: Any) -> Any:
+    """Return settings as TOML expresses them: {none = true} in place of None. See run_spec, which reads them."""
+    if isinstance(values, dict):
+        return {key: as_toml(value) for key, value in values.items()}
+    if isinstance(values, list):
+        return [as_toml(value) for value in values]
+    return {_NONE: True} if values is None else values

@@ -74,6 +74,37 @@ def test_runs_without_an_evaluation_are_compared_by_their_training(
     assert "never" in output  # a half of the runs did not reach the target
 
 
+def test_a_threshold_is_reached_by_evaluations_where_training_plays_another_task(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The shaped return of training reaches 475 at once, the true one of the evaluation after 2,000 env_steps."""
+    shaped = ["environment.training_kwargs.bonus=10"]
+    record(folder / "shaped", settings=shaped, returns=(900.0, 900.0, 900.0), evaluations={1: 470.0, 2: 480.0})
+    record(folder / "plain", evaluations={0: 475.0})
+    assert compare(["shaped", "plain"]) == 0
+    output = capsys.readouterr().out
+    rows = [" ".join(line.split()) for line in output.splitlines()]
+    assert [row.split()[1:6] for row in rows[2:4]] == [
+        ["1", "490.0", "1", "of", "1"],
+        ["1", "490.0", "1", "of", "1"],
+    ]
+    assert {row.split()[0]: row.split()[6] for row in rows[2:4]} == {"bonus=10": "2,950", "bonus=unset": "950"}
+    assert "by evaluations during training" in output
+
+
+def test_returns_of_different_tasks_are_not_compared(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(folder / "shaped", settings=["environment.no_reward_limit=9"], evaluation=None)
+    record(folder / "plain", evaluation=None)
+    assert compare(["shaped", "plain"]) == 0
+    output = capsys.readouterr().out
+    assert [line.split()[1:5] for line in output.splitlines()[2:4]] == [["1", "-", "-", "-"]] * 2
+    assert "final returns cannot be compared: training plays different tasks" in output
+    assert "daedalus resume " in output
+    record(folder / "same", settings=["environment.no_reward_limit=9"], seed=2, evaluation=None)
+    assert compare(["shaped", "same"]) == 0
+    assert "cannot be compared" not in capsys.readouterr().out
+
+
 def test_one_seed_has_no_interval(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record(folder / "a", settings=FAST)
     record(folder / "b", settings=SLOW)

@@ -430,11 +430,16 @@ def test_confirmation_that_cannot_be_saved_is_an_error(
         until(confirmations.poll)
 
 
-@pytest.mark.parametrize(("training_mean", "plays_again"), [(1000.0, True), (1.0, False), (None, False)])
+@pytest.mark.parametrize(
+    ("training_mean", "limit", "plays_again"),
+    [(1000.0, None, True), (1.0, None, False), (None, None, False), (1000.0, 400, False)],
+)
 def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_sampled_actions(
-    tmp_path: Path, output: ChildOutput, training_mean: float | None, plays_again: bool
+    tmp_path: Path, output: ChildOutput, training_mean: float | None, limit: int | None, plays_again: bool
 ) -> None:
-    run = save(tmp_path / "run", CARTPOLE, 5, evaluation={"final_episodes": 10})
+    """Not where training played another task, as with no_reward_limit: its returns say nothing then."""
+    environment = CARTPOLE.model_copy(update={"no_reward_limit": limit})
+    run = save(tmp_path / "run", environment, 5, evaluation={"final_episodes": 10})
     spec = read_policy(run / "checkpoints" / "0000000005").spec
     trained = {"solved": False, "env_steps": 9, "updates": 5, "episode_return_mean": training_mean}
     write_json(run / "summary.json", trained)
@@ -444,6 +449,9 @@ def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_samp
     assert summary["evaluation_return_mean"] == summary["evaluation"]["return_mean"]
     assert ("sampled_evaluation" in summary) == plays_again
     assert ("sampled actions: return" in report_of(local_run, summary)) == plays_again
+    assert (
+        f"the return {short_number(1000.0)} of training is that of another task" in report_of(local_run, summary)
+    ) == bool(limit)
     if plays_again:
         sampled = read_json(run / "summary.json")["sampled_evaluation"]
         assert (sampled["actions"], sampled["episodes"], sampled["policy_version"]) == ("sampled", 10, 5)

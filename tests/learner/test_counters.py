@@ -63,13 +63,25 @@ def test_target_is_reached_only_with_enough_episodes() -> None:
 def test_an_evaluation_solves_a_run_only_where_actors_explore() -> None:
     counters = RunCounters(2)
     target: dict[str, Any] = {"target_return": 5.0, "target_episodes": 2}
-    exploring, others = run_spec(algorithm="one_step_q", **target).training, run_spec(**target).training
+    exploring, others = run_spec(algorithm="one_step_q", **target), run_spec(**target)
     for mean, solved in ((4.9, False), (5.0, True), (2.0, True)):
         counters.evaluated(mean)
         assert (counters.is_solved(exploring), counters.is_solved(others)) == (solved, False)
-    assert not counters.is_solved(run_spec(algorithm="one_step_q").training)
+    assert not counters.is_solved(run_spec(algorithm="one_step_q"))
     counters.trained([rollout(returns=(9.0, 9.0))], 0, 1)
     assert counters.is_solved(others)
+
+
+def test_only_an_evaluation_solves_a_run_that_trains_on_another_task() -> None:
+    counters = RunCounters(2)
+    plain = run_spec(target_return=5.0, target_episodes=2)
+    shaped = plain.model_copy(
+        update={"environment": plain.environment.model_copy(update={"training_kwargs": {"bonus": 10}})}
+    )
+    counters.trained([rollout(returns=(9.0, 9.0))], 0, 1)
+    assert (counters.is_solved(plain), counters.is_solved(shaped)) == (True, False)
+    counters.evaluated(5.0)
+    assert counters.is_solved(shaped)
 
 
 def test_counters_of_an_earlier_release_are_restored() -> None:

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,12 @@ class TrainingRun:
         *,
         restored: Checkpoint | None = None,
         initial: SavedPolicy | None = None,
+        other_spaces: bool = False,
         **sections: Any,
     ) -> None:
         self.directory = directory / "run"
         self.directory.mkdir(exist_ok=restored is not None)
-        self._restored, self._initial = restored, initial
+        self._restored, self._initial, self._other_spaces = restored, initial, other_spaces
         self.spec = RunSpec.model_validate(
             {
                 "environment": {"id": "CartPole-v1", "frame_stack": 2},
@@ -101,6 +103,7 @@ class TrainingRun:
                 started=time.monotonic(),
                 restored=self._restored,
                 initial=self._initial,
+                other_spaces=self._other_spaces,
             ).run()
         finally:
             transport.close()
@@ -482,3 +485,25 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
         f"--init-from {initial.directory}: the weights 'encoder.layers.0.weight' are (8, 8) in the checkpoint and "
         "(9, 8) in this run's network: use the same environment and [policy] settings"
     )
+
+
+def test_weights_that_only_fit_by_their_shapes_are_refused_unless_that_is_allowed(tmp_path: Path) -> None:
+    (tmp_path / "first").mkdir()
+    first = TrainingRun(tmp_path / "first", **budget(100))
+    first.finish()
+    initial = read_policy(checkpoints(first.directory)[0])
+    space = initial.spaces.observations["observation"]
+    other = replace(initial, spaces=initial.spaces.model_copy(update={"observations": {"lidar": space}}))
+    for folder in ("refused", "allowed"):
+        (tmp_path / folder).mkdir()
+    with pytest.raises(CheckpointMismatchError, match=r"^--init-from .*: its policy is for other spaces: ob"):
+        TrainingRun(tmp_path / "refused", initial=other, **budget(100)).finish()
+    TrainingRun(tmp_path / "allowed", initial=other, other_spaces=True, **budget(100)).finish()
+    assert any("initial weights of other spaces" in line for line in LINES)
+    with pytest.raises(CheckpointMismatchError, match=r"policy\.activation is tanh there, and relu here"):
+        TrainingRun(
+            tmp_path / "first",
+            restored=load_newest(first.directory),
+            **budget(200),
+            policy={"hidden": [8], "memory": "gru", "memory_units": 4, "activation": "relu"},
+        ).finish()

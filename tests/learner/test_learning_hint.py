@@ -31,7 +31,7 @@ def hints(*rows: dict[str, float], normalizes_rewards: bool = False) -> list[str
 def test_run_with_a_collapsed_entropy_and_the_first_return_gets_one_hint() -> None:
     first, second, third = hints(row(0.01, -200.0, 1.4), row(0.2, -199.6, 0.1), row(0.3, -200.0, 0.1))
     assert (first, third) == ("", "")
-    assert second.startswith("this run does not learn: after a fifth of the budget the mean return is -200 as at the")
+    assert second.startswith("this run does not learn: after a fifth of the budget the mean return is -199.6, and w")
     assert "the entropy fell from 1.4 to 0.1" in second
     assert "training.entropy_bonus" in second
 
@@ -46,6 +46,19 @@ def test_run_with_a_collapsed_entropy_and_the_first_return_gets_one_hint() -> No
 )
 def test_run_that_learns_or_explores_gets_no_hint(last: dict[str, float]) -> None:
     assert hints(row(0.01, -200.0, 1.4), last) == ["", ""]
+
+
+def test_run_whose_return_rises_gets_no_hint_whatever_its_critic_explains() -> None:
+    rising = [row(0.1 + 0.02 * index, 5.9 + 2.0 * index, 1.0, -0.1) for index in range(6)]
+    assert set(hints(row(0.01, 5.9, 1.0, -5.0), *rising)) == {""}
+    evaluated = [row(0.1 + 0.02 * index, 5.9, 1.0, -0.1) for index in range(6)]  # where actors explore
+    for index, mean in ((0, 5.0), (2, 5.0), (4, 15.5)):
+        evaluated[index] |= {"evaluation_return_mean": mean, "evaluation_return_std": 1.0}
+    assert set(hints(row(0.01, 5.9, 1.0, -5.0), *evaluated)) == {""}
+    evaluated[4]["evaluation_return_mean"] = 5.0
+    assert hints(row(0.01, 5.9, 1.0, -5.0), *evaluated)[-1].startswith(
+        "this run does not learn: after a fifth of the budget the mean return is 5.9, and was 5.9 at the start, and"
+    )
 
 
 def test_run_whose_critic_explains_nothing_gets_a_hint() -> None:
@@ -69,7 +82,7 @@ def test_run_whose_returns_are_all_equal_gets_a_hint_of_its_own(entropy: float) 
     watched = [equal(0.1 + 0.02 * index, entropy) for index in range(6)]
     *before, last = hints(equal(0.01), *watched)
     assert set(before) == {""}
-    assert last.startswith("this run does not learn: every episode so far has the return -200, so")
+    assert last.startswith("this run has nothing to learn from: every episode so far has the return -200, so")
     watched[2]["episode_return_max"] = -199.0
     assert "every episode" not in hints(equal(0.01), *watched)[-1]
 

@@ -1,12 +1,17 @@
 """learner/run/settings.py: presets, assignments, and error messages of one line."""
 
+import datetime
+import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from daedalus.learner.run.run_directory import read_config, write_config
 from daedalus.learner.run.settings import (
     SettingsError,
+    assign,
     choose_algorithm,
     override,
     preset_names,
@@ -132,6 +137,110 @@ def test_value_none_unsets_a_setting() -> None:
     assert run_spec(settings("training.target_return=none", training={"target_return": 4.0})).training == (
         run_spec(settings()).training
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("True", True),
+        ("False", False),
+        ('"False"', "False"),  # a text, deliberately
+        (".5", 0.5),
+        ("1.", 1.0),
+        ("1_000", 1000),
+        ("0x10", 16),
+        ("None", None),
+        ("none", None),
+        ("null", None),
+        ("'none'", "none"),
+        ("{none = true}", None),
+        ("[True, None, {'a': .5}]", [True, None, {"a": 0.5}]),
+        ('{"a": null, "b": true}', {"a": None, "b": True}),
+        ("rgb_array", "rgb_array"),
+        ("maps/a b.c", "maps/a b.c"),
+        ("red,green", "red,green"),
+        ("5#a", "5#a"),
+        ("1.2.3", "1.2.3"),
+        ("...", "..."),
+        ("2024-01-01", "2024-01-01"),
+        ("12:30:00", "12:30:00"),
+    ],
+)
+@pytest.mark.parametrize("table", ["environment.kwargs", "environment.training_kwargs", "training.algorithm_kwargs"])
+def test_argument_reaches_its_constructor_as_the_value_that_was_written(
+    table: str, text: str, value: object, tmp_path: Path
+) -> None:
+    section, name = table.split(".")
+    spec = run_spec(settings(f"{table}.x={text}", training={"algorithm": "my_module:Mine"}))
+    write_config(tmp_path, spec)
+    welcome = Welcome(run="r", learner_epoch=1, seed=1, spec=spec)
+    for received in (spec, read_config(tmp_path), decode(encode(welcome), LEARNER_LIMITS).spec):  # type: ignore[union-attr]
+        found = getattr(getattr(received, section), name)["x"]
+        assert (type(found), found) == (type(value), value)
+
+
+@pytest.mark.parametrize(
+    ("text", "correction"),
+    [
+        ("08", "write 8, or '\"08\"' for the text"),
+        ("1__000", "write 1000, or "),
+        ("FALSE", "write false, or '\"FALSE\"' for the text"),
+        ("off", "write false, or '\"off\"' for the text"),
+        ("yes", "write true, or "),
+        ("Null", "write none, or "),
+        ("8,8", "write [8,8] for a list, or '\"8,8\"' for the text"),
+        ("True,False", "write [True,False] for a list, or "),
+        ("[a, b]", 'write it as [8, true, "text"] or {size = 8, mode = "text"}'),
+        ("{slippery=False}", 'write it as [8, true, "text"] or {size = 8, mode = "text"}'),
+        ("(8,8)", "write a list, [8, 8]"),
+        ("{1, 2}", "write a list, [1, 2]"),
+        ("[2024-01-01]", 'write a text, "2024-01-01"'),
+        ("nan", "write a finite number, or a text that the constructor reads"),
+        ("-inf", "write a finite number, or a text that the constructor reads"),
+        ("INFINITY", "write '\"INFINITY\"' for the text"),
+        ("[" * 5000, "write it as "),
+        ("[" * 80 + "]" * 80, "is nested too deeply"),
+    ],
+)
+def test_text_that_looks_like_a_value_is_refused_as_an_argument_with_the_spelling_that_works(
+    text: str, correction: str
+) -> None:
+    message = error_message(f"environment.kwargs.x={text}")
+    assert "environment.kwargs.x" in message
+    assert correction in message
+    if message.endswith(" for the text"):
+        quoted = message.rpartition("for the text")[0].split()[-1].strip("'")
+        assert run_spec(settings(f"environment.kwargs.x={quoted}")).environment.kwargs["x"] == text
+
+
+@pytest.mark.parametrize(
+    ("value", "kept"), [(np.int64(3), 3), (np.float32(0.5), 0.5), (np.bool_(False), False), ("none", "none")]
+)
+def test_argument_of_a_program_is_kept(value: object, kept: object) -> None:
+    made = settings()
+    assign(made, "environment.kwargs.x", value)
+    found = run_spec(made).environment.kwargs["x"]
+    assert (type(found), found) == (type(kept), kept)
+
+
+@pytest.mark.parametrize(
+    ("value", "correction"),
+    [
+        ((8, 8), "write a list, [8, 8]"),
+        ({8}, "write a list, [8]"),
+        (np.zeros(2), "write a list, as by its method tolist()"),
+        (Path("maps/a"), 'write a text, "maps/a"'),
+        (datetime.date(2024, 1, 1), 'write a text, "2024-01-01"'),
+        ({1: 2}, "write its keys as texts"),
+        (b"x", "write a number, a text in quotation marks"),
+        (math.inf, "write a finite number"),
+    ],
+)
+def test_argument_that_no_file_can_express_is_refused(value: object, correction: str) -> None:
+    for path, argument in (("x", value), ("x.list.0", {"list": [value]})):
+        message = error_message(environment={"id": "A-v0", "kwargs": {"x": argument}})
+        assert message.startswith(f"setting environment.kwargs.{path} is ")
+        assert correction in message
 
 
 def test_assignment_to_nested_tables_and_last_assignment_wins() -> None:

@@ -346,4 +346,10 @@ def test_images_are_told_from_other_arrays(shape: tuple[int, ...], dtype: str, i
 def test_evaluations_play_the_true_task() -> None:
     trained = EnvironmentSpec(id="A-v0", no_reward_limit=5, training_kwargs={"easy": True}, action_repeat=2)
     assert trained.as_evaluated() == EnvironmentSpec(id="A-v0", action_repeat=2)
+    assert not trained.trains_true_task
+    assert not EnvironmentSpec(id="A-v0", no_reward_limit=5).trains_true_task
+    same = {"kwargs": {"easy": True}, "training_kwargs": {"easy": True}}
+    assert EnvironmentSpec.model_validate(
+        {"id": "A-v0", "reward_scale": 0.1, "reward_clip": 1.0, **same}
+    ).trains_true_task
     assert trained.as_evaluated("envpool") == EnvironmentSpec(id="A-v0", action_repeat=2, backend="envpool")

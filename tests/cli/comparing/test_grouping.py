@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 from recorded_runs import record
 
+from daedalus.cli.comparing.comparison import compare_groups
 from daedalus.cli.comparing.grouping import by_settings, by_user, check_comparable, text
 from daedalus.cli.comparing.recorded_run import RecordedRun, read_run
+from daedalus.cli.comparing.tables import as_text
 from daedalus.learner.run.run_files import RunDataError
 
 
@@ -39,13 +41,27 @@ def test_groups_have_the_name_of_what_differs_and_its_order(tmp_path: Path) -> N
     ]
 
 
-def test_one_setting_names_the_groups_if_it_is_enough(tmp_path: Path) -> None:
+def test_all_settings_that_differ_name_the_groups(tmp_path: Path) -> None:
     """The algorithm first: other settings of a preset depend on it."""
-    other = ("training.algorithm=a3c", "collection.rollout_length=16", "training.learning_rate=0.001")
-    assert names(run(tmp_path, "a"), run(tmp_path, "b", *other)) == [
-        ("algorithm=a3c", ["b"]),
-        ("algorithm=impala", ["a"]),
+    other = ("training.algorithm=a3c", "training.learning_rate=0.001", "environment.kwargs.x=None")
+    runs = [run(tmp_path, "a"), run(tmp_path, "b", *other)]
+    assert names(*runs) == [
+        ("algorithm=a3c, x=none, learning_rate=0.001", ["b"]),
+        ("algorithm=impala, x=unset, learning_rate=0.003", ["a"]),
     ]
+    assert [group.unnamed for group in by_settings(runs)] == [[], []]
+    assert by_settings(runs, ["training.algorithm"])[0].unnamed == ["environment.kwargs.x", "training.learning_rate"]
+
+
+def test_a_name_of_many_settings_is_short_and_says_how_many_more_differ(tmp_path: Path) -> None:
+    other = [f"training.{name}=0.5" for name in ("discount_factor", "entropy_bonus", "trace_lambda", "rho_clip")]
+    runs = [run(tmp_path, "a"), run(tmp_path, "b", "environment.kwargs.map=" + "m" * 30, *other)]
+    named = by_settings(runs)[0]
+    assert named.name.startswith(f"map={'m' * 21}..., discount_factor=0.5")
+    assert (named.name.endswith(", +1 more"), named.unnamed) == (True, ["training.trace_lambda"])
+    assert "the groups also differ in training.trace_lambda" in as_text(compare_groups(by_settings(runs)))
+    longer = [run(tmp_path, f"n{n}", "environment.kwargs.map=" + "m" * n) for n in (30, 31)]
+    assert [name for name, _ in names(*longer)] == ["map=" + "m" * n for n in (30, 31)]  # shortened, they were equal
 
 
 def test_two_settings_name_the_groups_of_a_grid(tmp_path: Path) -> None:
@@ -84,10 +100,14 @@ def test_groups_of_the_user_keep_their_order(tmp_path: Path) -> None:
     assert [group.name for group in by_user(parts)] == ["hidden=[64]", "hidden=[32,32]"]
 
 
+def test_groups_of_the_user_are_named_by_all_values_of_their_runs(tmp_path: Path) -> None:
+    mixed = [run(tmp_path, "a"), run(tmp_path, "b", "policy.hidden=[32]")]
+    assert [group.name for group in by_user([mixed, [run(tmp_path, "c")]])] == ["hidden=[32]/[64,64]", "hidden=[64,64]"]
+
+
 def test_groups_of_the_user_that_no_setting_tells_apart_have_the_names_of_runs(tmp_path: Path) -> None:
-    mixed = [run(tmp_path, "a"), run(tmp_path, "b", "policy.hidden=[64]")]
-    same = [run(tmp_path, "c")]
-    assert [group.name for group in by_user([mixed, same])] == ["a and 1 more", "c"]
+    both = [[run(tmp_path, "a"), run(tmp_path, "b", seed=2)], [run(tmp_path, "c", seed=3)]]
+    assert [group.name for group in by_user(both)] == ["CartPole-v1, impala", "c"]
 
 
 def test_runs_of_different_environments_are_refused(tmp_path: Path) -> None:

@@ -57,6 +57,12 @@ class TestScore:
         assert (fast, slow) == (pytest.approx(0.8), pytest.approx(0.2))
         assert missed == pytest.approx((100.0 - 475.0) / 475.0)  # by the mean of the training episodes
 
+    def test_a_missed_target_is_ranked_by_the_evaluation_where_training_plays_another_task(
+        self, tmp_path: Path
+    ) -> None:
+        limit = ("--set", "environment.no_reward_limit=5", "--set", "evaluation.seconds=1")
+        assert self.run(tmp_path, *limit, evaluation=470.0) == pytest.approx((470.0 - 475.0) / 475.0)
+
     def test_others_are_ranked_by_their_final_return(self, tmp_path: Path) -> None:
         on = "training.stop_when_solved=false"
         assert self.run(tmp_path, "--set", on, evaluation=480.0, solved=True) == 480.0
