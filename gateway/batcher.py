@@ -9,7 +9,7 @@ import numpy as np
 from daedalus.actor.collecting.rollout_writer import RowInputs
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.policy_versions import PolicyVersion
-from daedalus.policy.acting.noise import draw_noise
+from daedalus.policy.acting.noise import joined_noise
 from daedalus.policy.acting.runtime import Choice, PolicyError
 
 _logger = logging.getLogger(__name__)
@@ -42,7 +42,6 @@ class Batcher:
         """
         self._current, self._clients, self._on_failure, self._on_fault = current, clients, on_failure, on_fault
         self._loop = asyncio.get_running_loop()
-        self._random = np.random.default_rng()
         self._waiting: dict[ClientActor, None] = {}
         self._next_call: asyncio.Handle | None = None
         self._pause_ends = 0.0  # by the loop's clock
@@ -78,8 +77,7 @@ class Batcher:
 
     def _choose(self, version: PolicyVersion, actors: list[ClientActor]) -> None:
         inputs = _joined([actor.begin_row() for actor in actors])
-        noise = draw_noise(version.runtime.noise_size, len(actors), self._random)
-        choice = version.runtime.act(inputs.observations, inputs.state, noise, inputs.masks, inputs.epsilon)
+        choice = version.runtime.act(inputs.observations, inputs.state, inputs.noise, inputs.masks, inputs.epsilon)
         for row, actor in enumerate(actors):
             actions = {name: values[row : row + 1] for name, values in choice.actions.items()}
             one = Choice(actions, choice.log_probs[row : row + 1], choice.state[row : row + 1])
@@ -101,4 +99,5 @@ def _joined(inputs: list[RowInputs]) -> RowInputs:
         np.concatenate([each.state for each in inputs]),
         {name: np.concatenate([each.masks[name] for each in inputs]) for name in first.masks},
         np.concatenate([each.epsilon for each in inputs]),
+        joined_noise([each.noise for each in inputs]),
     )

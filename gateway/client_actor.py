@@ -109,7 +109,7 @@ class ClientActor:
                 current.session.spec,
                 self._transforms,
                 current.runtime,
-                np.random.default_rng(),  # not used: the batcher draws the noise
+                np.random.default_rng((self._session.entropy(self.name), 0)),
                 epsilon=self._session.epsilon,
                 example_mask=self.spaces.example_mask,
                 on_full=self._keep,

@@ -16,7 +16,14 @@ from gymnasium import spaces as gym
 from pydantic import ValidationError
 
 from daedalus.gateway.errors import ClientError
-from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import (
+    LARGEST_OBSERVATION,
+    ArraySpace,
+    ContinuousSpace,
+    DiscreteSpace,
+    Spaces,
+    unfit_number,
+)
 
 _NUMBER_BYTES, _INTEGER_BYTES, _FLAG_BYTES = 32, 8, 8  # of one value in JSON, with a comma and some indentation
 _NAME_BYTES, _MESSAGE_BYTES = 128, 4096  # of one component's name, and of everything else in a message
@@ -186,10 +193,8 @@ def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarr
     if space.dtype == "uint8":
         return values.astype(np.uint8).reshape(space.shape)
     numbers = np.asarray(values, np.float64)
-    if not (np.abs(numbers) <= LARGEST_OBSERVATION).all():  # false for NaN too
-        if not np.isfinite(numbers).all():
-            raise ClientError("misfit", f"{what} has a value that is not finite")
-        raise _out_of_range(space, what)
+    if unfit := unfit_number(numbers):
+        raise ClientError("misfit", f"{what} {unfit}")
     return numbers.astype(np.float32).reshape(space.shape)
 
 
@@ -226,7 +231,7 @@ def _out_of_range(space: ArraySpace | DiscreteSpace, what: str) -> ClientError:
         return ClientError("misfit", f"{what} is outside its space, {space}")
     if space.dtype == "uint8":
         return ClientError("misfit", f"{what} has a value that is not from 0 to 255")
-    return ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observation")
+    return ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observations")
 
 
 def _check_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str) -> None:

@@ -4,6 +4,7 @@ Shapes are checked at construction, so an inconsistent message can neither be se
 messages, keys.py names the keys that they use, and the learner's intake decides which it accepts.
 """
 
+import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -62,6 +63,10 @@ class Welcome:
     def __post_init__(self) -> None:
         if not 0.0 <= self.epsilon <= 1.0:
             raise ValueError(f"epsilon is {self.epsilon}: it must be from 0 to 1")
+
+    def entropy(self, actor: str) -> int:
+        """Return 128 bits of the seed and the actor's name: seeds of 32 bits may be equal for two actors."""
+        return int.from_bytes(hashlib.sha256(f"{self.seed}/{actor}".encode()).digest()[:16])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,6 +18,23 @@ _MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an ou
 _MAX_COMPONENTS = 64
 _MAX_VARIABLES = 8_192  # of all discrete and continuous components together: a Join lists their bounds
 
+
+def unfit_number(values: np.ndarray) -> str:
+    """Return why no policy can act on, or learn from, numbers of an observation; empty if there is nothing wrong.
+
+    Actors, clients, evaluations and the learner refuse observations by this rule.
+    """
+    if values.dtype.kind != "f" or not values.size:
+        return ""
+    low, high = values.min(), values.max()  # nan if there is a nan
+    if -LARGEST_OBSERVATION <= low and high <= LARGEST_OBSERVATION:
+        return ""
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return f"has a value that is not finite ({values[~np.isfinite(values)][0]})"
+    beyond = low if low < -LARGEST_OBSERVATION else high
+    return f"has a value beyond +-{LARGEST_OBSERVATION:g} ({beyond:g}): scale or clip the observations"
+
+
 ComponentName = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,64}$")]
 
 

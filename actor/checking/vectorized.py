@@ -9,13 +9,13 @@ from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.violations import observation_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import uses_vector_entry_point
-from daedalus.actor.environments.interface import BackendEnvironments
+from daedalus.actor.environments.interface import BackendEnvironments, Observed
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spaces import Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
 _COUNT, _STEPS, _SECONDS = 2, 50, 1.0  # few: one environment was played before
@@ -44,9 +44,11 @@ def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spac
                     f"but its entry point has {spaces}"
                 )
             random, until = RandomActions(spaces.actions, seed), time.monotonic() + _SECONDS
-            masks = environments.reset(seed).masks
+            observed = environments.reset(seed)
             for _ in range(_STEPS):
-                masks = environments.step(_chosen(random, masks))[0].masks
+                observed, rewards, *_ = environments.step(_chosen(random, observed.masks))
+                if problem := _numbers_problem(observed, rewards):
+                    return f"environment {spec.id}: step returns {problem} (training uses its vector entry point)"
                 if time.monotonic() > until:
                     break
         finally:
@@ -68,6 +70,15 @@ def _observations_problem(environments: BackendEnvironments, spec: EnvironmentSp
         return f"reset returns {len(rows)} observations for {_COUNT} environments"
     found = (violation for row in rows for violation in observation_violations(space, row, "reset"))
     return next((text for kind, text in found if kind == "problem"), "")
+
+
+def _numbers_problem(observed: Observed, rewards: np.ndarray) -> str:
+    """Return what the learner would refuse, or an empty string."""
+    for name, frames in observed.frames.items():
+        if unfit := unfit_number(frames):
+            return f"an observation whose component {name!r} {unfit}"
+    faulty = ~np.isfinite(rewards)
+    return f"the reward {rewards[faulty][0]}: it must be finite" if faulty.any() else ""
 
 
 def _chosen(random: RandomActions, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

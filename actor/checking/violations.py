@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from daedalus.actor.environments.components import dtype_misfit
 from daedalus.actor.environments.leaves import LeftOut
 from daedalus.protocol.spaces import LARGEST_OBSERVATION, LARGEST_REWARD
 from daedalus.protocol.spec import EnvironmentSpec
@@ -63,6 +64,8 @@ def _array_violations(space: gymnasium.spaces.Box, value: Any, what: str, where:
         yield "problem", f"{what} of shape {array.shape}, but {where} has shape {space.shape}"
     elif not np.can_cast(array.dtype, space.dtype, "same_kind"):
         yield "problem", f"{what} of dtype {array.dtype}, but {where} has dtype {space.dtype}"
+    elif changed := dtype_misfit(space, array):
+        yield "problem", f"{what} that {changed}: declare {where} with a dtype that holds it"
     elif array.dtype.kind == "f" and not np.isfinite(array).all():
         index = _first(~np.isfinite(array))
         yield "problem", f"{what} with the value {array[index]} at index {_index(index)}: it must be finite"

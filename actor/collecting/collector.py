@@ -23,7 +23,7 @@ class Collector(Protocol):
     def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
         """Collect with a policy from now on; `load` provides its weights before the first rollout.
 
-        `seed` and `epsilon` are those of the learner's Welcome.
+        `seed` is the `entropy` of the learner's Welcome, and `epsilon` is its own.
         """
         ...
 

@@ -52,7 +52,7 @@ class EnvironmentCollector:
         """See Collector. Reset the environments."""
         environments = self._environments
         assert environments is not None
-        environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
+        environment_seed, *action_seed = np.random.SeedSequence(seed).generate_state(4).tolist()  # of 32 bits each
         self._runtime = runtime
         self._writer = RolloutWriter(
             environments.spaces,
@@ -63,7 +63,7 @@ class EnvironmentCollector:
             random=np.random.default_rng(action_seed),
             epsilon=epsilon,
         )
-        self._writer.start(environments.reset(int(environment_seed) % (_SEEDS - environments.count)))
+        self._writer.start(environments.reset(environment_seed % (_SEEDS - environments.count)))
 
     def load(self, snapshot: Snapshot) -> None:
         """See Collector."""

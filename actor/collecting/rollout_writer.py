@@ -7,7 +7,7 @@ import numpy as np
 from daedalus.actor.collecting.episode_counter import EpisodeCounter
 from daedalus.actor.environments.interface import Observed
 from daedalus.policy.acting.errors import PolicyError
-from daedalus.policy.acting.noise import draw_noise
+from daedalus.policy.acting.noise import Noise, draw_noise
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
@@ -22,6 +22,7 @@ class RowInputs(NamedTuple):
     state: np.ndarray  # [E, S] float32, the policy's memory before the row
     masks: dict[str, np.ndarray]  # of the masked actions [E, choices] bool
     epsilon: np.ndarray  # [E, 1] float32, the final epsilon of the actor
+    noise: Noise  # of the actor's own random numbers
 
 
 class RolloutWriter:
@@ -105,8 +106,7 @@ class RolloutWriter:
     def act(self) -> dict[str, np.ndarray]:
         """Return the actions {name: [E, D]} that the policy chooses for the next row."""
         inputs = self.begin_row()
-        noise = draw_noise(self._runtime.noise_size, self._count, self._random)
-        choice = self._runtime.act(inputs.observations, inputs.state, noise, inputs.masks, inputs.epsilon)
+        choice = self._runtime.act(inputs.observations, inputs.state, inputs.noise, inputs.masks, inputs.epsilon)
         self.take_choice(choice)
         return choice.actions
 
@@ -116,7 +116,8 @@ class RolloutWriter:
             for name, frames in self._stacks.frames.items():
                 self._frames[name][: self._depths[name]] = frames.swapaxes(0, 1)
             self._initial_state[:] = self._state
-        return RowInputs(self._stacks.observations, self._state, self._current_masks, self._epsilon)
+        noise = draw_noise(self._runtime.noise_size, self._count, self._random)
+        return RowInputs(self._stacks.observations, self._state, self._current_masks, self._epsilon, noise)
 
     def take_choice(self, choice: Choice) -> None:
         """Write what a policy chose from the inputs of this row."""
@@ -144,7 +145,9 @@ class RolloutWriter:
         # The row after a reset row is the first of its episode: its frame stack and memory begin anew.
         self._stacks.push(observed.frames, ~valid)
         self._current_masks = observed.masks
-        self._state = self._next_state * valid[:, None]
+        # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
+        goes_on = valid & np.isfinite(self._next_state).all(axis=1)
+        self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
         self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
         self._row += 1
         return self._row == len(self._rewards)

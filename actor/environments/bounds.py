@@ -20,9 +20,13 @@ class BoundedActions:
     def __init__(self, space: gymnasium.spaces.Box) -> None:
         self._space = space
         self._low, self._high = space.low.ravel().astype(np.float64), _highest(space.high)
+        if space.dtype == np.float16:  # without a bound, it cannot hold every number of a policy
+            largest = float(np.finfo(np.float16).max)
+            self._low, self._high = np.maximum(self._low, -largest), np.minimum(self._high, largest)
         self._bounded = _is_bound(space.low) & _is_bound(space.high)
         with np.errstate(invalid="ignore", over="ignore"):
             self._range = self._high - self._low
+            self._centre = np.where(self._bounded, self._low + 0.5 * self._range, 0.0).clip(self._low, self._high)
         self._rounded = space.dtype is not None and space.dtype.kind != "f"
 
     def of(self, values: np.ndarray) -> np.ndarray:
@@ -34,6 +38,9 @@ class BoundedActions:
                 scaled = self._low + (values.astype(np.float64) + 1.0) * 0.5 * self._range
             scaled = np.where(self._bounded, scaled, values)
         actions = np.minimum(np.maximum(scaled, self._low), self._high)
+        # Of a policy that saw a value that is not finite. The learner refuses the row; but an environment that gets
+        # such an action may return nothing finite any more, and an integer would be any.
+        actions = np.where(np.isnan(actions), self._centre, actions)
         if self._rounded:
             actions = np.rint(actions)
         return actions.reshape(len(values), *self._space.shape).astype(self._space.dtype)

@@ -50,23 +50,46 @@ class ObservationComponent(NamedTuple):
     def values(self, observations: Any) -> np.ndarray:
         """Return this component of batched observations: [E, *shape], uint8 or float32, discrete ones counted from 0.
 
-        Raises EnvironmentSetupError for a discrete value outside the space: it could not be encoded.
+        Raises EnvironmentSetupError for values of another shape than the space has, or that its dtype would change,
+        and for a discrete value outside the space: it could not be encoded.
         """
         values = self.leaf.of(observations)
+        space = self.leaf.space
+        if values.shape[1:] != (space.shape or ()) or values.dtype != space.dtype or not values.ndim:
+            values = self._fitted(values)
         values = values.reshape(len(values), *self.shape)
         if self.first is not None:
             values = values - self.first
             if ((values < 0) | (values >= self.counts)).any():
-                where = f" in component {self.leaf.name!r}" if self.leaf.path else ""
                 raise EnvironmentSetupError(
-                    f"the environment returned an observation outside its space{where}: "
+                    f"the environment returned an observation outside its space{self._where}: "
                     f"{described(values + self.first)} for {described(self.leaf.space)}"
                 )
             return values
         if values.dtype in (np.uint8, np.float32):
             return values
-        with np.errstate(over="ignore"):  # the learner names a value that is not finite
+        with np.errstate(all="ignore"):  # the learner, or the evaluation, names a value that is not finite
             return values.astype(np.float32)
+
+    @property
+    def _where(self) -> str:
+        return f" in component {self.leaf.name!r}" if self.leaf.path else ""
+
+    def _fitted(self, values: np.ndarray) -> np.ndarray:
+        """Return a batch, of a vector environment that did not make it by its spaces, in the dtype of the space."""
+        shape = self.leaf.space.shape or ()
+        if not values.ndim or [each for each in values.shape[1:] if each != 1] != [each for each in shape if each != 1]:
+            raise EnvironmentSetupError(
+                f"the environment returned a batch of observations of shape {values.shape}{self._where}, but after the "
+                f"number of environments it must have shape {shape}, as {described(self.leaf.space)}"
+            )
+        values = values.reshape(len(values), *shape)
+        if misfit := dtype_misfit(self.leaf.space, values):
+            raise EnvironmentSetupError(
+                f"the environment returned an observation outside its space{self._where}: it {misfit}"
+            )
+        with np.errstate(all="ignore"):
+            return values.astype(self.leaf.space.dtype)
 
 
 def observation_components(space: gymnasium.Space) -> tuple[ObservationComponent, ...]:
@@ -120,8 +143,10 @@ class ActionComponents:
     def _component(self, leaf: Leaf) -> ActionSpace:
         match leaf.space:
             case gym.Discrete() as space:
+                _check_choices(space, np.array(int(space.start) + int(space.n) - 1))
                 return DiscreteSpace(counts=(int(space.n),))
             case gym.MultiDiscrete() as space:
+                _check_choices(space, space.start.astype(np.int64) + space.nvec.astype(np.int64) - 1)
                 return DiscreteSpace(counts=tuple(int(count) for count in space.nvec.ravel()))
             case gym.MultiBinary() as space:
                 return DiscreteSpace(counts=(2,) * int(np.prod(space.shape)))
@@ -140,6 +165,12 @@ class ActionComponents:
                 return self._bounded[leaf.name].of(values)
             case space:
                 return values.reshape(len(values), *(space.shape or ())).astype(space.dtype)
+
+
+def _check_choices(space: gymnasium.Space, last: np.ndarray) -> None:
+    """Raise EnvironmentSetupError if the dtype of a space cannot hold its last choices."""
+    if misfit := dtype_misfit(space, last):
+        raise EnvironmentSetupError(f"action space {described(space)} {misfit}: give it a wider dtype")
 
 
 def _nested(space: gymnasium.Space, path: tuple[str | int, ...], parts: dict[tuple[str | int, ...], Any]) -> Any:
@@ -181,18 +212,25 @@ def batch_of_one(space: gymnasium.Space, value: Any, where: str = "the observati
 
 def _converted(space: gymnasium.Space, array: np.ndarray, where: str) -> np.ndarray:
     """Return an array in the dtype of its space. Raises ValueError if that would change it."""
+    with np.errstate(all="ignore"):
+        if array.dtype.kind == "f" and not np.isfinite(seen := array.astype(np.float32)).all():  # as the policy sees it
+            raise ValueError(f"{where} has a value that is not finite ({array[~np.isfinite(seen)].flat[0]:g})")
+        if misfit := dtype_misfit(space, array):
+            raise ValueError(f"{where} {misfit}: pass it as the environment returns it")
+        return array.astype(space.dtype)
+
+
+def dtype_misfit(space: gymnasium.Space, array: np.ndarray) -> str:
+    """Return which number the dtype of a space would change, or an empty string. Floats are only rounded."""
+    if array.dtype == space.dtype or space.dtype is None:
+        return ""
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"{where} has dtype {array.dtype}: it must have numbers, of dtype {space.dtype}")
-    with np.errstate(over="ignore"):
-        if array.dtype.kind == "f" and not np.isfinite(array.astype(np.float32)).all():  # as the policy sees it
-            raise ValueError(f"{where} has a value that is not finite")
-    converted = array.astype(space.dtype)
-    if converted.dtype.kind != "f" and array.dtype != converted.dtype and (changed := converted != array).any():
-        raise ValueError(
-            f"{where} has the value {array[changed].flat[0]:g}, but its space has dtype {space.dtype}: "
-            "pass it as the environment returns it"
-        )
-    return converted
+        return f"has dtype {array.dtype}: it must have numbers, of dtype {space.dtype}"
+    if space.dtype.kind == "f":
+        return ""
+    with np.errstate(all="ignore"):
+        changed = array.astype(space.dtype) != array
+    return f"has the value {array[changed].flat[0]:g}, but its space has dtype {space.dtype}" if changed.any() else ""
 
 
 def only_of_batch(space: gymnasium.Space, batch: Any) -> Any:

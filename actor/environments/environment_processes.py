@@ -31,6 +31,7 @@ from daedalus.actor.environments.environment_errors import (
 )
 from daedalus.actor.environments.episode_info import info_to_keep
 from daedalus.actor.environments.leaves import leaves
+from daedalus.actor.environments.wrappers import OfItsSpace
 
 _CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a video
 _TERMINATE_SECONDS = 1.0  # for a process that handles SIGTERM itself
@@ -115,7 +116,7 @@ class _Maker:
             # Forked processes have the same global generator; some environments use it in place of their own.
             np.random.seed()
             threading.Thread(target=_end_after, args=(parent,), name="parent-watch", daemon=True).start()
-        return OfItsOwnProcess(self.make(), self.name, self.left_out)
+        return OfItsOwnProcess(OfItsSpace(self.make(), self.name, self.left_out), self.name, self.left_out)
 
 
 def _end_after(parent: multiprocessing.process.BaseProcess) -> None:

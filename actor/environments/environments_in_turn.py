@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from daedalus.actor.environments.environment_errors import creation_errors, hint_of_count
 from daedalus.actor.environments.episode_info import info_to_keep
 from daedalus.actor.environments.masks import MASK_KEY
+from daedalus.actor.environments.wrappers import OfItsSpace
 
 
 class EnvironmentsInTurn(SyncVectorEnv):
@@ -19,12 +20,15 @@ class EnvironmentsInTurn(SyncVectorEnv):
     To collect all entries of every step takes a tenth of the time of MuJoCo's environments.
     """
 
-    def __init__(self, name: str, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
+    def __init__(
+        self, name: str, makers: Sequence[Callable[[], gymnasium.Env]], *, left_out: Sequence[str] = ()
+    ) -> None:
         """Make the environments. If one cannot be made, close the others: a simulator may outlive this process.
 
         Args:
           name: id of the environments, for errors.
           makers: functions, each of which creates one environment.
+          left_out: names of components of the observation that nobody reads.
 
         Raises EnvironmentSetupError.
         """
@@ -33,7 +37,7 @@ class EnvironmentsInTurn(SyncVectorEnv):
         def make(maker: Callable[[], gymnasium.Env]) -> gymnasium.Env:
             with creation_errors(name, hint_of_count(len(made), len(makers))):
                 made.append(maker())
-            return made[-1]
+                return OfItsSpace(made[-1], name, left_out)
 
         try:
             super().__init__([partial(make, maker) for maker in makers], autoreset_mode=AutoresetMode.NEXT_STEP)

@@ -220,7 +220,7 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
         return EnvironmentProcesses(spec.id, [factory] * count, left_out=spec.leave_out)
-    return EnvironmentsInTurn(spec.id, [factory] * count)
+    return EnvironmentsInTurn(spec.id, [factory] * count, left_out=spec.leave_out)
 
 
 def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:

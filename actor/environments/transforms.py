@@ -1,5 +1,6 @@
 """The transforms of a specification, applied to a backend's environments: components, action table, pixels, masks."""
 
+import logging
 from typing import Any
 
 import gymnasium
@@ -19,8 +20,10 @@ from daedalus.actor.environments.interface import BackendEnvironments, Observed,
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
+
+_logger = logging.getLogger(__name__)
 
 
 class Transforms:
@@ -82,11 +85,17 @@ class Transforms:
           action_mask: as BackendEnvironments has it.
           needed: [E] bool, whether an action will be taken from the observation: then a choice must be legal.
 
-        Raises EnvironmentSetupError for a mask that forbids every choice where one is needed, or of a wrong size.
+        Raises EnvironmentSetupError for a mask that forbids every choice where one is needed, or of a wrong size, and
+        for observations of another shape or dtype than their space.
         """
         frames = {}
         for component in self._observations:
             values, pixels = component.values(observations), self._pixels.get(component.leaf.name)
+            if len(values) != len(needed):
+                raise EnvironmentSetupError(
+                    f"the environment returned {len(values)} observations of {component.leaf.name!r} for "
+                    f"{len(needed)} environments"
+                )
             frames[component.leaf.name] = values if pixels is None else pixels(values)
         if self._observed_masks:
             action_mask = self._observed_masks.of(observations)
@@ -100,14 +109,18 @@ class Transforms:
           action_mask: the legal choices, one array or a map of them by action component; None without masks.
           needed: whether an action will be taken from it.
 
-        Raises ValueError if the observation or the mask does not fit the spaces.
+        Raises ValueError if the observation or the mask does not fit the spaces, or no policy can act on it.
         """
         batch = batch_of_one(self._observation_space, observation)
         mask = None if action_mask is None else mask_of_one(action_mask)
         try:
-            return self.observe(batch, mask, np.array([needed]))
+            observed = self.observe(batch, mask, np.array([needed]))
         except EnvironmentSetupError as error:
             raise ValueError(str(error)) from None
+        for name, frames in observed.frames.items():
+            if unfit := unfit_number(frames):
+                raise ValueError(f"component {name!r} of the observation {unfit}")
+        return observed
 
     def env_actions(self, actions: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for the run's {name: [E, D]}."""
@@ -127,7 +140,9 @@ class TransformedEnvironment:
         For `one_episode` see make_environments.
         """
         self._environments = environments
-        self._one_episode = one_episode
+        self._name, self._one_episode = spec.id, one_episode
+        self._ended = np.zeros(environments.count, np.bool_)  # [E] whether the next step only resets
+        self._warned_of_rewards = False
         self._over = np.zeros(environments.count, np.bool_)  # [E] whether the only episode of each has ended
         self._transforms = Transforms(
             spec, environments.observation_space, environments.action_space, environments.action_mask
@@ -146,18 +161,46 @@ class TransformedEnvironment:
     def reset(self, seed: int) -> Observed:
         """See VectorEnvironment."""
         observations = self._environments.reset(seed)
-        self._over[:] = False
+        self._over, self._ended = np.zeros((2, self.count), np.bool_)
         return self._transforms.observe(observations, self._environments.action_mask, np.ones(self.count, np.bool_))
 
     def step(self, actions: dict[str, np.ndarray]) -> Step:
         """See VectorEnvironment."""
         observations, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
         ended = terminated | truncated
+        if self._ended.any():
+            rewards = self._rewards_of_steps(rewards, ended)
+        self._ended = ended
         if self._one_episode:
             ended = self._over = self._over | ended
         needed = ~ended  # after an episode's end the next step only resets, or the environment stands still
         observed = self._transforms.observe(observations, self._environments.action_mask, needed)
         return observed, rewards, terminated, truncated
+
+    def _rewards_of_steps(self, rewards: np.ndarray, ended: np.ndarray) -> np.ndarray:
+        """Return the rewards [E] without those of environments that only reset in this step: no action earned them.
+
+        Raises EnvironmentSetupError if an episode ends there. The next step of that environment would be a reset by its
+        own account and a real one by ours.
+        """
+        resets = self._ended
+        if (ended & resets).any():
+            number = np.flatnonzero(ended & resets)[0]
+            raise EnvironmentSetupError(
+                f"environment {self._name}: environment {number} ends an episode in the step "
+                "after an episode's end, which only resets (AutoresetMode.NEXT_STEP): return terminated and truncated "
+                "False there"
+            )
+        ignored = rewards[resets & (rewards != 0.0)]
+        if len(ignored) and not self._warned_of_rewards:
+            self._warned_of_rewards = True
+            _logger.warning(
+                "environment %s: it gives the reward %g in a step that only resets after an episode's end "
+                "(AutoresetMode.NEXT_STEP): such rewards are ignored; return 0 there, or the last reward with the end",
+                self._name,
+                ignored[0],
+            )
+        return np.where(resets, 0.0, rewards)
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See VectorEnvironment."""

@@ -1,17 +1,23 @@
 """Wrappers of one gymnasium environment: masks in `info`, repeated actions, one episode for each seed."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces as gym
 
+from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.environments.components import dtype_misfit
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.leaves import leaves, without
 from daedalus.actor.environments.masks import MASK_KEY
 from daedalus.policy.user_code import first_line, place_of
 
 Camera = Callable[[np.ndarray], None]
+
+_ARRAYS = (gym.Box, gym.Discrete, gym.MultiDiscrete, gym.MultiBinary)
 
 
 class Shutter:
@@ -41,6 +47,47 @@ class MaskInInfo(gymnasium.Wrapper):
 
     def _mask(self) -> Any:
         return self.env.get_wrapper_attr("action_masks")()
+
+
+class OfItsSpace(gymnasium.Wrapper):
+    """A wrapper that refuses an observation which would be another one in a batch with those of other environments.
+
+    To copy it there, gymnasium converts an integer that is too large for the dtype of the space to another number, and
+    its shared memory takes other shapes and fractions, too.
+    """
+
+    def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str] = ()) -> None:
+        """Construct from the environment, its id, and the names of components that nobody reads."""
+        super().__init__(environment)
+        self._name = name
+        self._read_space = without(environment.observation_space, left_out)
+        self._leaves = [leaf for leaf in leaves(self._read_space, "observation") if isinstance(leaf.space, _ARRAYS)]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium.Env. Raises EnvironmentSetupError, as `step`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._check("reset", observation)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """See gymnasium.Env."""
+        result = self.env.step(action)
+        self._check("step", result[0])
+        return result
+
+    def _check(self, call: str, observation: Any) -> None:
+        for leaf in self._leaves:
+            space = leaf.space
+            try:
+                array = leaf.of(observation)
+            except (KeyError, IndexError, TypeError, ValueError):
+                return  # it has no such part: no batch can be made of it, and whoever tries names it
+            if array.dtype == space.dtype and array.shape == space.shape:
+                continue
+            if array.size != np.prod(space.shape or (), dtype=np.int64) or dtype_misfit(space, array):
+                for kind, text in observation_violations(self._read_space, observation, call):
+                    if kind == "problem":
+                        raise EnvironmentSetupError(f"environment {self._name}: {text}")
 
 
 class RepeatedSteps(gymnasium.Wrapper):

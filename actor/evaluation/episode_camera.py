@@ -9,7 +9,7 @@ import numpy as np
 
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.running_episodes import RunningEpisodes
+from daedalus.actor.evaluation.running_episodes import RunningEpisodes, refuse_unfit_rewards
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.policy.user_modules import UserModules
@@ -82,6 +82,7 @@ class EpisodeCamera:
             choice = running.act(self._noise(runtime.noise_size, running.observations))
             taken = {name: values[:1] for name, values in choice.actions.items()}
             observed, rewards, terminated, truncated = environments.step(taken)
+            refuse_unfit_rewards(rewards, np.zeros(1, np.int64))
             running.observe(observed)
             total += float(rewards[0])
             facts = action_facts(spaces, choice)

@@ -8,7 +8,7 @@ import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import Observed, VectorEnvironment
-from daedalus.actor.evaluation.running_episodes import RunningEpisodes
+from daedalus.actor.evaluation.running_episodes import RunningEpisodes, refuse_unfit_rewards
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, EvaluationSpec
@@ -80,7 +80,8 @@ def play_episodes(
       progress: called after every step with the number of episodes that ended and their mean return (NaN at first).
         If it returns True, the episodes in progress are cut, and no other begins.
 
-    Returns: the results of the episodes that began. Raises EnvironmentSetupError for a reward that is not finite.
+    Returns: the results of the episodes that began. Raises EnvironmentSetupError for a reward that is not finite, and
+    for an observation that a policy cannot act on.
     """
     environment_seed, action_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(2))
     results = _Results(episodes)
@@ -90,11 +91,22 @@ def play_episodes(
         if not _play_round(runtime, environments, observed, random, first, results, longest, progress):
             break
     played = results.lengths > 0
+    _refuse_unfit_returns(results.returns)
     return Evaluation(
         returns=results.returns[played].astype(np.float32),
         lengths=results.lengths[played],
         cut=~results.ended[played],
     )
+
+
+def _refuse_unfit_returns(returns: np.ndarray) -> None:
+    """Raise EnvironmentSetupError for a sum of finite rewards that float32 cannot hold."""
+    faulty = np.abs(returns) > np.finfo(np.float32).max
+    if faulty.any():
+        raise EnvironmentSetupError(
+            f"the return of episode {np.flatnonzero(faulty)[0] + 1} of the evaluation is {returns[faulty][0]:g}, which "
+            "float32 cannot hold: scale the rewards of the environment"
+        )
 
 
 class _EpisodeNoise:
@@ -145,10 +157,10 @@ def _play_round(
     running.observe(observed)
     playing = numbers < len(results.returns)
     for _ in range(longest):
-        choice = running.act(random.draw())
+        choice = running.act(random.draw(), playing)
         actions = {name: values[:count] for name, values in choice.actions.items()}
         observed, rewards, terminated, truncated = environments.step(actions)
-        _check_finite(rewards[playing], numbers[playing])
+        refuse_unfit_rewards(rewards[playing], numbers[playing])
         running.observe(observed)
         results.returns[numbers[playing]] += rewards[playing]
         results.lengths[numbers[playing]] += 1
@@ -160,16 +172,6 @@ def _play_round(
         if not playing.any():
             break
     return True
-
-
-def _check_finite(rewards: np.ndarray, numbers: np.ndarray) -> None:
-    """Raise EnvironmentSetupError if a reward [n] of the episodes `numbers` [n] is not finite: they have no return."""
-    faulty = ~np.isfinite(rewards)
-    if faulty.any():
-        raise EnvironmentSetupError(
-            f"the environment gave the reward {rewards[faulty][0]} in episode {numbers[faulty][0] + 1} of the "
-            "evaluation: rewards must be finite; correct its `step`"
-        )
 
 
 def _rows(count: int) -> int:

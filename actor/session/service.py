@@ -148,7 +148,7 @@ class ActorService:
             self._feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self._config.name, count, welcome.spec.environment.id)
         runtime = self._runtimes.make(confirmed, spaces, count)
-        self._collector.begin(runtime, confirmed.spec, confirmed.seed, confirmed.epsilon)
+        self._collector.begin(runtime, confirmed.spec, confirmed.entropy(self._config.name), confirmed.epsilon)
         self._upload_maker = make_upload_maker(confirmed.spec, spaces, self._config.modules)
         if confirmed.spec.algorithm.synchronous:
             self._feed.subscribe()

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces, unfit_number
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import Rollout
 
@@ -47,12 +47,7 @@ def _observation_violation(rollout: Rollout, frames: np.ndarray, space: ArraySpa
         return "" if (frames < np.array(space.counts)).all() else f"has a value outside {space}"
     if frames.dtype == np.uint8:
         return ""
-    low, high = float(frames.min()), float(frames.max())  # nan if there is a nan
-    if not (np.isfinite(low) and np.isfinite(high)):
-        return "has a value that is not finite"
-    if max(-low, high) > LARGEST_OBSERVATION:
-        return f"has a value beyond +-{LARGEST_OBSERVATION:g}: scale or clip the observations"
-    return ""
+    return unfit_number(frames)
 
 
 def _action_violation(rollout: Rollout, actions: np.ndarray, space: DiscreteSpace | ContinuousSpace) -> str:

@@ -6,7 +6,7 @@ longer, so that no rollout is trained on twice, is in former_incarnations.py.
 The lock of the actor server guards all of it.
 """
 
-import zlib
+import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -31,6 +31,11 @@ _MAX_OF_ONE_OWNER = 4096  # so that one certificate cannot fill the fleet
 _FORGET_SECONDS = 60.0  # of absence
 _EPSILON = 1  # distinguishes this draw from others by the same seed and name
 _SWEEP_SECONDS = 1.0  # between searches for actors to forget
+
+
+def _number(name: str) -> int:
+    """Return 128 bits of a name's digest: a shorter one would give some names the same random numbers."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:16])
 
 
 class Fleet:
@@ -168,12 +173,12 @@ class Fleet:
 
         It differs by name, by incarnation and by `start_version`, the policy version that the run continued from.
         """
-        entropy = [self._seed, zlib.crc32(name.encode()), self.incarnation_number(name), start_version]
+        entropy = [self._seed, _number(name), self.incarnation_number(name), start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def epsilon_for(self, name: str) -> float:
         """Return the final epsilon of an actor: drawn by the run's seed and the name, the same in every incarnation."""
-        random = np.random.default_rng([self._seed, zlib.crc32(name.encode()), _EPSILON])
+        random = np.random.default_rng([self._seed, _number(name), _EPSILON])
         return self._epsilons[int(random.integers(len(self._epsilons)))]
 
     # ---------------------------------------------------------------------------------------------- forgetting

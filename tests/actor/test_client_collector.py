@@ -106,8 +106,8 @@ def test_client_rollouts_equal_those_of_an_environment_collector(environment: di
         played.spec.environment, played.runtime(), rollout_length=ROWS, seed=3, weights=played.snapshot(0).weights
     )
     # Each collector samples from one generator: give the client the seed that the other derives for its actions.
-    _, action_seed = np.random.SeedSequence(3).generate_state(2)
-    client.begin(played.runtime(), played.spec, int(action_seed))
+    _, *action_seed = np.random.SeedSequence(3).generate_state(4).astype("<u4")
+    client.begin(played.runtime(), played.spec, int.from_bytes(np.array(action_seed).tobytes(), "little"))
     client.load(played.snapshot(0))
     found: list[Rollout] = []
     for version in range(8):

@@ -14,8 +14,10 @@ from plain import PlainPolicy, plain, vector_spaces
 
 from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import Observed, Step
 from daedalus.policy.acting.noise import Noise
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec
 from daedalus.protocol.uploads import Rollout
 
@@ -376,3 +378,64 @@ def test_environments_are_kept_if_the_backend_makes_fewer_than_requested() -> No
 
 def test_a_rollout_can_be_collected_at_any_time() -> None:
     assert EnvironmentCollector().has_rollout()
+
+
+# --------------------------------------------------------------------------- observations that the learner refuses
+
+
+class Summing(PlainPolicy):
+    """A policy whose memory is the sum of all observations, for stacks, of their newest frame."""
+
+    state_size = 1
+
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        newest = observations.reshape(len(observations), -1)[:, -1:]
+        return np.zeros(len(state), np.int64), np.zeros(len(state), np.float32), state + newest
+
+
+def _unfit(rollout: Rollout) -> bool:
+    return not all(np.isfinite(values).all() for values in (plain(rollout.frames), rollout.initial_state))
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("place", [2, 9, 10])  # within an episode, before its end, and its last one
+@pytest.mark.parametrize(("rollout_length", "frame_stack"), [(3, 1), (1, 1), (4, 4)])
+def test_one_number_that_is_not_finite_spoils_at_most_two_rollouts(
+    number: str, place: int, rollout_length: int, frame_stack: int
+) -> None:
+    """Three in a row quarantine an actor. Episodes have 10 steps, only the first environment is at fault."""
+    shown: list[Any] = [1.0] * 11
+    shown[place] = number
+    spec = EnvironmentSpec(id="faulty_environments:Showing-v0", kwargs={"shown": shown}, frame_stack=frame_stack)
+    modules = UserModules(frozenset({"faulty_environments"}))
+    collector = started_collector(spec, Summing(), count=2, rollout_length=rollout_length, modules=modules)
+    rollouts = [copy.deepcopy(collect(collector)) for _ in range(16 // rollout_length)]
+    spoilt = [_unfit(rollout) for rollout in rollouts]
+    assert 1 <= sum(spoilt[: 12 // rollout_length]) <= 2
+    collector.close()
+
+
+# ------------------------------------------------------------------------------------- steps that only reset
+
+
+def _showing_vector(oddity: str) -> EnvironmentSpec:
+    return EnvironmentSpec(id="faulty_environments:ShowingVector-v0", kwargs={"shown": [0, 0, 0], "oddity": oddity})
+
+
+def test_rewards_of_a_step_that_only_resets_do_not_count(caplog: pytest.LogCaptureFixture) -> None:
+    modules = UserModules(frozenset({"faulty_environments"}))
+    collector = started_collector(_showing_vector("rewards"), PlainPolicy(), rollout_length=9, modules=modules)
+    rollout = collect(collector)
+    assert rollout.rewards[:, 0].tolist() == [1, 1, 0] * 3
+    assert rollout.valid[:, 0].tolist() == [True, True, False] * 3
+    assert rollout.episode_returns.tolist() == [2.0] * 3
+    assert caplog.text.count("it gives the reward 50 in a step that only resets") == 1
+
+
+def test_an_episode_that_ends_in_a_step_that_only_resets_is_refused() -> None:
+    modules = UserModules(frozenset({"faulty_environments"}))
+    collector = started_collector(_showing_vector("flags"), PlainPolicy(), rollout_length=9, modules=modules)
+    with pytest.raises(EnvironmentSetupError, match="environment 0 ends an episode in the step after an episode's end"):
+        collect(collector)

@@ -1,6 +1,7 @@
 """play_episodes: whole episodes in rounds, one in each environment."""
 
 import os
+import re
 from typing import Any
 
 import numpy as np
@@ -144,6 +145,41 @@ def test_a_reward_that_is_not_finite_ends_the_evaluation() -> None:
     environments = make_environments(spec, 2, modules=modules, one_episode=True)
     with pytest.raises(EnvironmentSetupError, match="gave the reward nan in episode 1 of the evaluation"):
         play_episodes(AlwaysZero(), environments, 2, 1, sampled=False)
+
+
+SHOWING = UserModules(frozenset({"faulty_environments"}))
+
+
+def showing(shown: list[Any], name: str = "Showing-v0", **kwargs: Any) -> EnvironmentSpec:
+    return EnvironmentSpec(id=f"faulty_environments:{name}", kwargs={"shown": shown, **kwargs})
+
+
+@pytest.mark.parametrize("name", ["Showing-v0", "ShowingVector-v0"])
+@pytest.mark.parametrize(
+    ("shown", "kwargs", "reason"),
+    [
+        ([0, "nan", 0, 0], {}, "component 'observation' has a value that is not finite (nan), in environment 0"),
+        (["-inf", 0, 0], {}, "has a value that is not finite (-inf)"),
+        ([0, 1e300, 0], {"space": "float64"}, "has a value that is not finite (inf)"),
+        ([0, 1e16, 0], {"space": "float64"}, "has a value beyond +-1e+15 (1e+16)"),
+        ([0, 300, 0], {"space": "int8", "dtype": "int64"}, "has the value 300, but its space has dtype int8"),
+        ([0, -1, 0], {"space": "uint8", "dtype": "int64"}, "dtype"),
+        ([0, 0, 0], {"rewards": [0, "inf", 0]}, "the reward inf in episode 1"),
+        ([0, 0, 0], {"rewards": [0, 1e300, 0]}, "the reward 1e+300 in episode 1"),
+        ([0, 0, 0, 0], {"rewards": [0, 3e38, 3e38, 0]}, "the return of episode 1 of the evaluation is 6e+38"),
+    ],
+)
+def test_evaluation_refuses_numbers_that_training_refuses(
+    name: str, shown: list[Any], kwargs: dict[str, Any], reason: str
+) -> None:
+    environments = make_environments(showing(shown, name, **kwargs), 1, modules=SHOWING, one_episode=True)
+    with pytest.raises(EnvironmentSetupError, match=re.escape(reason)):
+        play_episodes(AlwaysZero(), environments, 1, 1, sampled=False)
+
+
+def test_nobody_acts_on_the_last_observation_of_an_episode() -> None:
+    environments = make_environments(showing([0, 0, "nan"]), 2, modules=SHOWING, one_episode=True)
+    assert play_episodes(AlwaysZero(), environments, 3, 1, sampled=False).lengths.tolist() == [2, 2, 2]
 
 
 def test_environments_in_processes_are_limited_per_processor() -> None:

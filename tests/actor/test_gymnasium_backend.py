@@ -462,6 +462,29 @@ def test_observation_that_stops_to_fit_is_named(monkeypatch: pytest.MonkeyPatch,
         environments.step({"action": np.zeros((2, 1), np.int64)})
 
 
+@pytest.mark.parametrize("processes", [False, True])
+@pytest.mark.parametrize(
+    ("space", "dtype", "number", "reason"),
+    [
+        ("int8", "int64", 300, "the value 300, but its space has dtype int8"),
+        ("int16", "int32", -40_000, "the value -40000, but its space has dtype int16"),
+        ("uint8", "uint16", 256, "the value 256, but its space has dtype uint8"),
+    ],
+)
+def test_number_that_the_dtype_of_its_space_cannot_hold_is_refused(
+    space: str, dtype: str, number: Any, reason: str, processes: bool
+) -> None:
+    kwargs = {"shown": [0, number, 0], "space": space, "dtype": dtype}
+    spec = EnvironmentSpec(id="faulty_environments:Showing-v0", kwargs=kwargs, processes=processes)
+    environments = created(spec, 2, modules=UserModules(frozenset({"faulty_environments"})))
+    try:
+        environments.reset(1)
+        with pytest.raises(EnvironmentSetupError, match=f"Showing-v0: step returns an observation .*{reason}"):
+            environments.step({"action": np.zeros((2, 1), np.int64)})
+    finally:
+        environments.close()
+
+
 def test_only_one_environment_is_reset_to_learn_whether_there_are_masks(monkeypatch: pytest.MonkeyPatch) -> None:
     resets = []
     monkeypatch.setattr(

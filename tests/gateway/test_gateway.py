@@ -124,6 +124,26 @@ def test_clients_that_wait_are_chosen_for_in_one_call(
     assert rows == [3]
 
 
+def test_samples_of_a_client_follow_the_seed_and_its_name(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of the first agent of a Client do."""
+    drawn: list[np.ndarray] = []
+    act = OnnxRuntime.act
+    monkeypatch.setattr(OnnxRuntime, "act", lambda self, *given: drawn.append(given[2].uniform) or act(self, *given))
+    for name in ("plumless", "buckeroo"):  # whose checksums by CRC-32 are equal
+        client = connect()
+        client.hello(name)
+        fill_rollout(client)
+        session = gateway.gateway._seats[name].actor._session
+        assert session is not None
+        random = np.random.default_rng((session.entropy(name), 0))
+        expected = [random.random(2, np.float32) for _ in range(ROWS + 1)]
+        np.testing.assert_array_equal(np.concatenate(drawn), expected)
+        drawn.clear()
+    assert session.entropy("plumless") != session.entropy("buckeroo")
+
+
 def test_client_whose_action_cannot_be_sent_is_disconnected_and_the_others_act(
     learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:

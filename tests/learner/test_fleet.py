@@ -255,6 +255,14 @@ def test_epsilon_is_drawn_by_seed_and_name_and_is_the_same_after_a_restart() -> 
         assert fleet_status.page(fleet, "", 0.0)[0].epsilon == drawn(1)[0]
 
 
+def test_names_with_the_same_checksum_share_neither_seed_nor_epsilon() -> None:
+    """CRC-32 of both names is the same."""
+    fleet = Fleet(2, None, tuple(number / 1000 for number in range(1000)))
+    names = ("plumless", "buckeroo")
+    assert len({fleet.seed_for(name, 0) for name in names}) == 2
+    assert len({fleet.epsilon_for(name) for name in names}) == 2
+
+
 def test_statuses_are_sorted_by_actor_name() -> None:
     fleet = joined_fleet("b", "a")
     fleet.actors["b"].rejected["stale"] += 2
