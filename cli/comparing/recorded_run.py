@@ -23,7 +23,7 @@ RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
 _NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
 _SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
 _LARGEST = 1e300
-_MAX_METRICS_BYTES = 1 << 30  # a month of rows at the default log interval
+_MAX_METRICS_BYTES = 2 << 30  # a month of rows at the default log interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from daedalus.learner.reporting.metrics import COLUMNS, Details
 from daedalus.policy.saving.replacing import replacing
+from daedalus.protocol.texts import exact_number
 
 _BLOCK_BYTES = 1 << 16
 
@@ -37,7 +38,7 @@ class CsvWriter:
         new = [name for name in row if name not in self._columns]
         if new:
             self._add_columns(new)
-        self._append([_cell(row.get(name)) for name in self._columns])
+        self._append([exact_number(row.get(name)) for name in self._columns])
 
     def _append(self, cells: Sequence[str]) -> None:
         data = _line(cells)
@@ -104,7 +105,3 @@ def _rows(path: Path) -> Iterator[Sequence[str]]:
             yield from csv.reader(file)
         except csv.Error as error:
             raise OSError(errno.EILSEQ, f"{path.name} is damaged ({error}): move it away", str(path)) from None
-
-
-def _cell(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

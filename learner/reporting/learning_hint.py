@@ -3,6 +3,8 @@
 import math
 from collections.abc import Mapping
 
+from daedalus.protocol.texts import exact_number, short_number
+
 _BASELINE_EPISODES = 20  # after so many, the policy is still about as random as at the start,
 _BASELINE_PROGRESS = 0.05  # unless they took more than this share of the budget
 _JUDGED_PROGRESS, _WATCHED_PROGRESS = 0.2, 0.1  # shares of the budget: of the judgement, and of the rows that count
@@ -61,16 +63,16 @@ class LearningHint:
         mean, deviation = self._first_return
         if self._lowest == self._highest:
             return (
-                f"this run does not learn: every episode so far has the return {self._lowest:.4g}, so that no "
-                "action was better than another; check the reward, and whether random actions can reach the goal"
+                f"this run does not learn: every episode so far has the return {exact_number(self._lowest)}, so that "
+                "no action was better than another; check the reward, and whether random actions can reach the goal"
             )
         first, entropy = self._first_entropy or 0.0, row.get("entropy", 0.0)
         no_better = row["episode_return_mean"] <= mean + 0.25 * deviation
         if no_better and first > 0.0 and entropy < _COLLAPSED * first:
             return (
-                f"this run does not learn: after a fifth of the budget the mean return is {mean:.4g} as at the start, "
-                f"and the entropy fell from {first:.3g} to {entropy:.3g}, so the policy explores no more; try a larger "
-                "training.entropy_bonus or a smaller training.learning_rate"
+                f"this run does not learn: after a fifth of the budget the mean return is {short_number(mean)} as at "
+                f"the start, and the entropy fell from {first:.3g} to {entropy:.3g}, so the policy explores no more; "
+                "try a larger training.entropy_bonus or a smaller training.learning_rate"
             )
         if len(self._explained) >= _LEAST_ROWS and max(self._explained) < 0.0:
             normalize = "" if self._normalizes_rewards else "training.normalize_rewards=true or "

@@ -16,7 +16,7 @@ from daedalus.learner.reporting.metrics import Details, tag
 
 _BINS = 30  # of returns and lengths
 _MOST_BINS = 256  # of actions
-_SMALLEST_RANGE = 1e-9  # of values, relative to the largest: a float has few numbers within a smaller one
+_SMALLEST_RANGE = 1e-12  # of values, relative to the largest: a float has few numbers within a smaller one
 
 
 class TensorBoardWriter:

@@ -13,6 +13,7 @@ from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 from daedalus.protocol.texts import short_number
+from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER
 
 _MAX_IN_PROGRESS = 16
 
@@ -53,8 +54,10 @@ class Evaluations:
         if directory is None or version != report.policy_version:
             reason = f"evaluator {report.evaluator!r} has no evaluation of policy version {report.policy_version}"
             return Acknowledgement(verdict="rejected", reason=reason), ""
-        if not np.isfinite(report.returns).all():
-            return Acknowledgement(verdict="rejected", reason="returns has a value that is not finite"), ""
+        if not (np.abs(report.returns) <= LARGEST_EPISODE_NUMBER).all():
+            return Acknowledgement(
+                verdict="rejected", reason="returns has a value that is not finite, or too large"
+            ), ""
         if (report.lengths < 1).any():
             return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), ""
         del self.in_progress[report.evaluator]

@@ -13,6 +13,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics import COLUMNS, Details, tag
+from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.training.update_metrics import METRICS
 
@@ -31,7 +32,17 @@ def test_csv_has_a_header_and_a_line_for_each_row_with_blank_unknown_values(tmp_
     writer.close()
     assert tuple(row) == COLUMNS
     known = {name: text for name, text in row.items() if text}
-    assert known == {"env_steps": "12345678", "wall_seconds": "1.23457", "policy_loss": "-1e-09"}
+    assert known == {"env_steps": "12345678", "wall_seconds": "1.23456789", "policy_loss": "-1e-09"}
+
+
+@pytest.mark.parametrize(
+    "value", [1_000_001.0, 1234567.0, 16_777_217.0, 1e9 + 1, 2e-5 / 3, 1e-9, -0.1, 1e22, np.float64(1 / 3), 2**53 - 1]
+)
+def test_numbers_are_exact_in_the_csv(tmp_path: Path, value: float) -> None:
+    with closing(CsvWriter(tmp_path / "metrics.csv")) as writer:
+        writer.write({"env_steps": 2**33 + 1, "user/score": value, "episode_return_mean": value}, NONE)
+    (row,) = read_rows(tmp_path / "metrics.csv")
+    assert row == {"env_steps": 2**33 + 1, "user/score": value, "episode_return_mean": value}
 
 
 def test_csv_continues_after_a_resume_without_a_second_header(tmp_path: Path) -> None:
