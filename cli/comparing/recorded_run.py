@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from daedalus.learner.reporting.metrics_file import lasting
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
 from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
@@ -32,7 +33,8 @@ class RecordedRun:
 
     directory: Path
     settings: Mapping[str, Any]  # by `section.key`; empty without config.toml
-    metrics: Mapping[str, np.ndarray]  # columns of metrics.csv, [rows]; NaN: no value
+    # Columns of metrics.csv, [rows]; NaN: no value. Without rows that a resumed run has undone.
+    metrics: Mapping[str, np.ndarray]
     summary: Mapping[str, Any]  # summary.json; empty before the end of training
 
     def setting(self, path: str) -> Any:
@@ -78,15 +80,14 @@ class RecordedRun:
     def reached(self, threshold: float) -> tuple[float, float]:
         """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.
 
-        Infinite if the mean did not reach the threshold. Rows that a resumed run repeated, from its checkpoint on,
-        replace the earlier ones. The precision is that of the rows of metrics.csv, except for the target of a run that
-        stopped at it. The metrics need wall_seconds.
+        Infinite if the mean did not reach the threshold. The precision is that of the rows of metrics.csv, except for
+        the target of a run that stopped at it. The metrics need wall_seconds.
         """
         at_target = self.summary.get("solved") and threshold == self.target
         steps, seconds = self.summary.get("env_steps"), self.summary.get("seconds_to_target")
         if at_target and self.settings.get("training.stop_when_solved") and steps is not None and seconds is not None:
             return float(steps), seconds / 60.0
-        above = (self.metrics[RETURN] >= threshold) & not_repeated(self.metrics[ENV_STEPS])
+        above = self.metrics[RETURN] >= threshold
         episodes = self.metrics.get("episodes")
         if episodes is not None:  # the mean of fewer episodes may be luck
             above &= episodes >= self.settings.get("training.target_episodes", 1)
@@ -144,20 +145,11 @@ def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
 def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
     """Return the metrics of a run, `metrics.csv`, as arrays [rows] by the names of the columns; NaN: no value.
 
-    docs/reference/metrics.md explains the columns. Rows that a resumed run repeated from its checkpoint on replace the
-    earlier ones.
+    docs/reference/metrics.md explains the columns. Rows that a resumed run has undone are left out.
 
     Raises RunDataError if the directory has no metrics.
     """
-    metrics = read_run(one_run(Path(directory))).metrics
-    newest = not_repeated(metrics[ENV_STEPS])
-    return {name: column[newest] for name, column in metrics.items()}
-
-
-def not_repeated(x: np.ndarray) -> np.ndarray:
-    """Return which rows a resumed run did not repeat, [rows] bool: after them x, [rows], is always larger."""
-    least_later = np.append(np.minimum.accumulate(x[::-1])[::-1][1:], np.inf)
-    return x < least_later
+    return dict(read_run(one_run(Path(directory))).metrics)
 
 
 def _settings(path: Path) -> dict[str, Any]:
@@ -217,7 +209,9 @@ def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     if not rows:
         raise RunDataError(nothing)
     values = [_numbers(path, number, row, len(header)) for number, row in enumerate(rows, start=2)]
-    return dict(zip(header, np.array(values).T, strict=True))
+    found = dict(zip(header, np.array(values).T, strict=True))
+    kept = lasting(*(found[name] for name in (ENV_STEPS, SECONDS) if name in found))
+    return {name: column[kept] for name, column in found.items()}
 
 
 def _numbers(path: Path, line: int, row: Sequence[str], cells: int) -> list[float]:

@@ -3,6 +3,7 @@
 The checkpoint of a policy is kept while an evaluator plays the policy. The best checkpoints are kept permanently.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,6 +33,12 @@ class Evaluations:
     def checkpoints_in_use(self) -> set[Path]:
         """Directories of the checkpoints that must not be pruned."""
         return {directory for directory, _, _ in self.in_progress.values()}
+
+    def carry_over(self, undone: Sequence[Mapping[str, float]]) -> None:
+        """Keep, from rows that a resumed run undoes, the newest evaluation of a policy up to its checkpoint."""
+        for row in undone:
+            if row.get("evaluation_env_steps", np.inf) <= self.counters.env_steps:
+                self.newest = {name: value for name, value in row.items() if name.startswith("evaluation_")}
 
     def begin(self, evaluator: str, directory: Path, policy_version: int, env_steps: int) -> None:
         """Start the evaluation of the policy in `directory`; it replaces the evaluator's previous evaluation.

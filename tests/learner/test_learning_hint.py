@@ -31,7 +31,7 @@ def hints(*rows: dict[str, float], normalizes_rewards: bool = False) -> list[str
 def test_run_with_a_collapsed_entropy_and_the_first_return_gets_one_hint() -> None:
     first, second, third = hints(row(0.01, -200.0, 1.4), row(0.2, -199.6, 0.1), row(0.3, -200.0, 0.1))
     assert (first, third) == ("", "")
-    assert second.startswith("this run does not learn: after a fifth of the budget the mean return is -200 as at the")
+    assert second.startswith("this run does not learn: after a fifth of the budget the mean return is -200.0 as at the")
     assert "the entropy fell from 1.4 to 0.1" in second
     assert "training.entropy_bonus" in second
 
