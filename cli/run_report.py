@@ -8,7 +8,7 @@ from typing import Any
 
 from daedalus.cli.processes import UNWRITABLE, discard
 from daedalus.cli.running.local_run import LocalRun
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.texts import exact_number, short_number
 
 
 def report(run: LocalRun, summary: dict[str, Any]) -> str:
@@ -18,11 +18,11 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
     updates = f"{summary['updates']:,} updates{skipped}"
     if summary["solved"]:
         trained = (
-            f"solved: mean return {target:g} reached after {summary['seconds_to_target']:.1f} s; "
+            f"solved: mean return {exact_number(target)} reached after {summary['seconds_to_target']:.1f} s; "
             f"{summary['env_steps']:,} env_steps, {updates} in all"
         )
     else:
-        goal = "" if target is None else f" (the target {target:g} was not reached)"
+        goal = "" if target is None else f" (the target {exact_number(target)} was not reached)"
         trained = f"done: {summary['env_steps']:,} env_steps, {updates}{goal}"
     evaluation = summary["evaluation"]
     evaluated = (

@@ -16,7 +16,7 @@ from daedalus.learner.ranks.errors import RankLostError
 from daedalus.learner.ranks.opening import OpenRanks, no_other_ranks
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
-from daedalus.learner.reporting.run_records import RunRecords, load_history
+from daedalus.learner.reporting.run_records import RunRecords, continue_records
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.heartbeat import Heartbeat
@@ -144,8 +144,8 @@ class LearnerService:
         """
         try:
             self._server.open()
-            if self._restored is not None:
-                load_history(self._state, self._server.history)
+            version = self._restored.policy.policy_version if self._restored is not None else 0
+            continue_records(self._state, version, self._server.history, self._server.events)
             from daedalus.learner.training.learner import Learner
 
             self._ranks = ranks = self._open_ranks(self._spec, self._stop)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.texts import exact_number, short_number
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpointer import Checkpointer
@@ -54,7 +54,8 @@ class TargetConfirmation:
             return True
         training = self._state.spec.training
         episodes = f"{training.target_episodes} new episodes"
-        text = f"target {training.target_return:g} reached: the policy of this moment plays {episodes} to confirm it"
+        target = exact_number(training.target_return)
+        text = f"target {target} reached: the policy of this moment plays {episodes} to confirm it"
         self._events.add("target", text, cause=f"version {policy_version}")
         try:
             result = self._played_with(policy_version)

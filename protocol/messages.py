@@ -16,7 +16,7 @@ from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
-from daedalus.protocol.uploads import Gradient, Rollout
+from daedalus.protocol.uploads import EPISODE_DTYPES, Gradient, Rollout
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,14 +186,14 @@ class EvaluationReport:
     evaluator: str
     learner_epoch: int
     policy_version: int
-    returns: np.ndarray  # [K] float32, unscaled undiscounted returns
+    returns: np.ndarray  # [K] float64, or float32: unscaled undiscounted returns
     lengths: np.ndarray  # [K] int32, in env_steps
 
     def __post_init__(self) -> None:
         if self.returns.ndim != 1 or not len(self.returns) or self.returns.shape != self.lengths.shape:
             raise ValueError("returns and lengths must both be [K], with K at least 1")
-        if self.returns.dtype != np.float32 or self.lengths.dtype != np.int32:
-            raise ValueError("returns must be float32 and lengths int32")
+        if self.returns.dtype not in EPISODE_DTYPES or self.lengths.dtype != np.int32:
+            raise ValueError("returns must be float64 or float32, and lengths int32")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

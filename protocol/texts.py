@@ -17,4 +17,13 @@ def bounded_text(text: str, most: int = MAX_TEXT) -> str:
 
 def short_number(value: float) -> str:
     """Return a number of any size with at least three digits that count: 1,234,567, 987.1, 0.982 or 1.2e-05."""
-    return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
+    if abs(value) >= 1e15 or abs(value) < 10.0:
+        return f"{value or 0.0:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}"
+
+
+def exact_number(value: float | None) -> str:
+    """Return the shortest text that is read as the same number: 475, 1000001, 2e-05 or 16777217.5; empty for None."""
+    if value is None:
+        return ""
+    return str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")

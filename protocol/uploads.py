@@ -13,6 +13,9 @@ import numpy as np
 from daedalus.protocol.keys import check_name
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
+# A float32 has no number between 16,777,216 and 16,777,218: results of episodes are exact in float64 alone.
+EPISODE_DTYPES = (np.dtype(np.float64), np.dtype(np.float32))
+LARGEST_EPISODE_NUMBER = float(np.finfo(np.float32).max)  # of returns and scalars: sums of their squares are finite
 LARGEST_GRADIENT_NORM = 1e12  # no healthy actor comes near it, and the mean of many gradients stays finite
 # Names in Gradient.metrics: the terms of the loss (algorithms/gradients.py), and the diagnostics that an algorithm
 # gives of a rollout (algorithms/diagnostics.py).
@@ -67,9 +70,10 @@ class Rollout:
     terminated: np.ndarray  # [T, E] bool, the environment ended the episode
     truncated: np.ndarray  # [T, E] bool, a limit ended the episode
     valid: np.ndarray  # [T, E] bool, False where the environment only reset
-    episode_returns: np.ndarray  # [K] float32, unscaled undiscounted returns of the episodes that ended in this rollout
+    # [K] float64, or float32: unscaled undiscounted returns of the episodes that ended in this rollout
+    episode_returns: np.ndarray
     episode_lengths: np.ndarray  # [K] int32, their env_steps
-    # By name [n] float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
+    # By name [n] float64, or float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
 
@@ -205,8 +209,8 @@ def _check_episodes(upload: Upload) -> None:
     returns, lengths = upload.episode_returns, upload.episode_lengths
     if returns.ndim != 1 or returns.shape != lengths.shape:
         raise ValueError("episode_returns and episode_lengths must both be [K]")
-    if returns.dtype != np.float32:
-        raise ValueError(f"episode_returns must be float32, not {returns.dtype}")
+    if returns.dtype not in EPISODE_DTYPES:
+        raise ValueError(f"episode_returns must be float64 or float32, not {returns.dtype}")
     if lengths.dtype.kind not in "iu":
         raise ValueError("episode_lengths must be integers")
     if len(upload.episode_info) > MAX_INFO_NAMES:
@@ -214,7 +218,8 @@ def _check_episodes(upload: Upload) -> None:
     most = min(len(returns), MAX_INFO_VALUES)
     for name, values in upload.episode_info.items():
         check_name(name, "the name in episode_info")
-        if values.ndim != 1 or values.dtype != np.float32 or not 1 <= len(values) <= most:
+        if values.ndim != 1 or values.dtype not in EPISODE_DTYPES or not 1 <= len(values) <= most:
             raise ValueError(
-                f"episode_info {name!r} must be float32 [n], with n from 1 to {most}, not {values.dtype} {values.shape}"
+                f"episode_info {name!r} must be float64 or float32 [n], with n from 1 to {most}, "
+                f"not {values.dtype} {values.shape}"
             )

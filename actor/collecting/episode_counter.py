@@ -9,7 +9,7 @@ import numpy as np
 class FinishedEpisodes:
     """K episodes, in the order in which they ended."""
 
-    returns: np.ndarray  # [K] float32, undiscounted and unscaled
+    returns: np.ndarray  # [K] float64, undiscounted and unscaled
     lengths: np.ndarray  # [K] int32, env_steps
 
 
@@ -54,6 +54,6 @@ class EpisodeCounter:
         finished, self._finished = self._finished, []
         returns, lengths = zip(*finished, strict=True) if finished else ((), ())
         return FinishedEpisodes(
-            returns=np.concatenate([np.zeros(0), *returns]).astype(np.float32),
+            returns=np.concatenate([np.zeros(0), *returns]),
             lengths=np.concatenate([np.zeros(0, np.int32), *lengths]),
         )

@@ -6,7 +6,7 @@ import numpy as np
 
 from daedalus.actor.environments.masks import MASK_KEY
 from daedalus.protocol.keys import is_name
-from daedalus.protocol.uploads import MAX_INFO_NAMES, MAX_INFO_VALUES
+from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER, MAX_INFO_NAMES, MAX_INFO_VALUES
 
 
 def info_to_keep(info: dict[Any, Any], *, ended: bool) -> dict[str, Any]:
@@ -68,14 +68,13 @@ class EpisodeInfo:
             if not known or not _is_scalars_name(name):
                 continue
             given = ended & np.asarray(info.get(f"_{name}", True), np.bool_)
-            with np.errstate(over="ignore"):
-                scalars = values[given].astype(np.float32)
-            scalars = scalars[np.isfinite(scalars)]
+            scalars = values[given].astype(np.float64)
+            scalars = scalars[np.abs(scalars) <= LARGEST_EPISODE_NUMBER]  # not nan
             if len(scalars):
                 kept = self._values.setdefault(name, [])
                 kept.extend(scalars[: MAX_INFO_VALUES - len(kept)].tolist())
 
     def take(self) -> dict[str, np.ndarray]:
-        """Return the scalars since the last call: name -> [n] float32, n at least 1."""
+        """Return the scalars since the last call: name -> [n] float64, n at least 1."""
         values, self._values = self._values, {}
-        return {name: np.array(kept, np.float32) for name, kept in values.items()}
+        return {name: np.array(kept, np.float64) for name, kept in values.items()}

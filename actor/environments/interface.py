@@ -58,7 +58,7 @@ class VectorEnvironment(Protocol):
         ...
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
-        """Return scalars of `info` at the ends of the episodes since the last call: name -> [n] float32.
+        """Return scalars of `info` at the ends of the episodes since the last call: name -> [n] float64.
 
         Empty if the environment reports none, or the backend does not pass them on.
         """

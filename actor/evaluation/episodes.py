@@ -23,7 +23,7 @@ _ENVIRONMENTS_PER_PROCESSOR = 4  # if each is a process: enough to keep a proces
 class Evaluation:
     """The results of an evaluation's episodes, in the order of their seeds."""
 
-    returns: np.ndarray  # [episodes] float32, undiscounted and unscaled
+    returns: np.ndarray  # [episodes] float64, undiscounted and unscaled
     lengths: np.ndarray  # [episodes] int32, env_steps
     cut: np.ndarray  # [episodes] bool, whether the episode was cut: its return is that of the part that was played
 
@@ -93,7 +93,7 @@ def play_episodes(
     played = results.lengths > 0
     _refuse_unfit_returns(results.returns)
     return Evaluation(
-        returns=results.returns[played].astype(np.float32),
+        returns=results.returns[played],
         lengths=results.lengths[played],
         cut=~results.ended[played],
     )

@@ -20,6 +20,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import exact_number, short_number
 
 _DESCRIPTION = """\
 Makes one environment and plays it with random actions: whether reset and step keep to gymnasium's interface, whether
@@ -128,7 +129,7 @@ def _description(spec: RunSpec, report: EnvironmentReport) -> Iterator[tuple[str
         yield (
             "episodes",
             f"{len(lengths):,} ended, after {lengths.min()} to {lengths.max()} env_steps; "
-            f"return {returns.min():.4g} to {returns.max():.4g}, mean {returns.mean():.4g}",
+            "return {} to {}, mean {}".format(*map(short_number, (returns.min(), returns.max(), returns.mean()))),
         )
     if report.env_steps:
         yield (
@@ -140,7 +141,7 @@ def _description(spec: RunSpec, report: EnvironmentReport) -> Iterator[tuple[str
 
 def _choices(spec: RunSpec, network: str) -> Iterator[tuple[str, str]]:
     collection, training = spec.collection, spec.training
-    target = "no target" if training.target_return is None else f"target return {training.target_return:g}"
+    target = "no target" if training.target_return is None else f"target return {exact_number(training.target_return)}"
     yield (
         "train",
         f"{training.algorithm}, {collection.actors} actors x {collection.envs_per_actor} environments, rollouts of "

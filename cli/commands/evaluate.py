@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import gymnasium
-import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
@@ -227,7 +226,7 @@ def _actions(policy: SavedPolicy, arguments: argparse.Namespace) -> str:
 
 
 def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation, actions: str) -> dict[str, Any]:
-    returns = evaluation.returns.astype(np.float64)
+    returns = evaluation.returns
     note = _note(evaluation, policy.spec.evaluation.max_episode_env_steps, sampled=actions == "sampled")
     return {
         "environment": spec.id,
@@ -242,7 +241,7 @@ def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation, 
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "length_mean": float(evaluation.lengths.mean()),
-        "returns": returns.round(4).tolist(),
+        "returns": returns.tolist(),
         "lengths": evaluation.lengths.tolist(),
     }
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RecordedRun, not_repeated
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RecordedRun
 from daedalus.cli.comparing.statistics import interquartile_interval, interquartile_mean
 
 _POINTS = 200
@@ -22,9 +22,9 @@ class Curve:
 
 
 def points(run: RecordedRun, column: str, by: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the known values of a column, [rows], and where they lie, [rows], increasing.
+    """Return where the known values of a column lie, [rows], increasing, and the values, [rows].
 
-    Rows that a resumed run repeated from its checkpoint on replace the earlier ones.
+    Of several values at the same place, the newest counts.
 
     Args:
       run: the run.
@@ -35,7 +35,7 @@ def points(run: RecordedRun, column: str, by: str) -> tuple[np.ndarray, np.ndarr
     y = run.metrics[column]
     known = ~np.isnan(y) & ~np.isnan(x)
     x, y = x[known], y[known]
-    newest = not_repeated(x)
+    newest = x < np.append(x[1:], np.inf)
     return x[newest], y[newest]
 
 
@@ -68,7 +68,8 @@ def evaluations(run: RecordedRun, by: str) -> tuple[np.ndarray, np.ndarray]:
     if at is None or returns is None:
         return np.zeros(0), np.zeros(0)
     by_env_steps = {env_steps: value for env_steps, value in zip(at, returns, strict=True) if not np.isnan(env_steps)}
-    x, y = np.array(list(by_env_steps)), np.array(list(by_env_steps.values()))
+    x = np.array(sorted(by_env_steps))  # several evaluators report in any order
+    y = np.array([by_env_steps[env_steps] for env_steps in x])
     if by != ENV_STEPS and len(x):
         at_rows, seconds = points(run, SECONDS, ENV_STEPS)
         x = np.interp(x, at_rows, seconds) / 60.0 if len(at_rows) else np.full(len(x), np.nan)

@@ -50,6 +50,7 @@ def draw_curves(groups: Sequence[Group], output: Path, by: str) -> None:
             else:
                 _draw_run(axis, group, column, by)
         axis.set_title(title.format(band), fontsize=10)
+        axis.ticklabel_format(useOffset=False)  # an offset in a corner would hide what the ticks are
         axis.grid(alpha=0.3)
     for axis in axes[1]:
         axis.set_xlabel(by)
@@ -71,13 +72,14 @@ def draw_profiles(groups: Sequence[Group], output: Path) -> None:
     every = every[~np.isnan(every)]
     if not len(every):
         raise RunDataError("no episode of these runs has ended: there is no final return")
-    margin = max(np.ptp(every), 1.0) * 0.05
+    margin = (np.ptp(every) or abs(every[0]) or 1.0) * 0.05
     thresholds = np.linspace(every.min() - margin, every.max() + margin, _THRESHOLDS)
     figure, axis = plt.subplots(figsize=(7, 4.5), layout="constrained")
     for group, scores in zip(groups, returns, strict=True):
         (line,) = axis.plot(thresholds, performance_profile([scores], thresholds), label=group.name)
         low, high = profile_interval([scores], thresholds)
         axis.fill_between(thresholds, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+    axis.ticklabel_format(useOffset=False)
     axis.set_xlabel("return")
     axis.set_ylabel("share of runs with a higher final return")
     axis.set_title("performance profiles (band: 95 % interval)", fontsize=10)

@@ -12,6 +12,7 @@ from typing import Any
 
 from daedalus.cli.comparing.recorded_run import ENVIRONMENT, SEED, RecordedRun
 from daedalus.learner.run.run_files import RunDataError
+from daedalus.protocol.texts import exact_number
 
 _SERVICE = "service."  # settings of how the learner runs, not of what it learns
 _FIRST = ("training.algorithm", "collection.upload", "collection.rollout_length")  # the names that say most
@@ -156,7 +157,7 @@ def text(value: Any) -> str:
     if value is None:
         return "unset"
     if isinstance(value, float):
-        return f"{value:g}"
+        return exact_number(value)
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from daedalus.learner.reporting.metrics_file import lasting
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
 from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
@@ -26,7 +27,7 @@ EVALUATION = "evaluation_return_mean"  # during training
 _NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
 _SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
 _LARGEST = 1e300
-_MAX_METRICS_BYTES = 1 << 30  # a month of rows at the default log interval
+_MAX_METRICS_BYTES = 2 << 30  # a month of rows at the default log interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,7 +36,8 @@ class RecordedRun:
 
     directory: Path
     settings: Mapping[str, Any]  # by `section.key`; empty without config.toml
-    metrics: Mapping[str, np.ndarray]  # columns of metrics.csv, [rows]; NaN: no value
+    # Columns of metrics.csv, [rows]; NaN: no value. Without rows that a resumed run has undone.
+    metrics: Mapping[str, np.ndarray]
     summary: Mapping[str, Any]  # summary.json; empty before the end of training
 
     def setting(self, path: str) -> Any:
@@ -105,19 +107,18 @@ class RecordedRun:
         """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.
 
         `evaluated` takes the mean returns of evaluations during training; NaN if there was none. Infinite if the mean
-        did not reach the threshold. Rows that a resumed run repeated, from its checkpoint on,
-        replace the earlier ones. The precision is that of the rows of metrics.csv, except for the target of a run that
-        stopped at it. The metrics need wall_seconds.
+        did not reach the threshold. The precision is that of the rows of metrics.csv, except for the target of a run
+        that stopped at it. The metrics need wall_seconds.
         """
         at_target = self.summary.get("solved") and threshold == self.target
         steps, seconds = self.summary.get("env_steps"), self.summary.get("seconds_to_target")
         if at_target and self.settings.get("training.stop_when_solved") and steps is not None and seconds is not None:
             return float(steps), seconds / 60.0
-        newest = not_repeated(self.metrics[ENV_STEPS])
-        returns = self.metrics.get(EVALUATION, np.full(len(newest), np.nan)) if evaluated else self.metrics[RETURN]
+        rows = len(self.metrics[ENV_STEPS])
+        returns = self.metrics.get(EVALUATION, np.full(rows, np.nan)) if evaluated else self.metrics[RETURN]
         if evaluated and np.isnan(returns).all():
             return math.nan, math.nan
-        above = (returns >= threshold) & newest
+        above = returns >= threshold
         episodes = self.metrics.get("episodes")
         if episodes is not None and not evaluated:  # the mean of fewer episodes may be luck
             above &= episodes >= self.settings.get("training.target_episodes", 1)
@@ -176,20 +177,11 @@ def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
 def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
     """Return the metrics of a run, `metrics.csv`, as arrays [rows] by the names of the columns; NaN: no value.
 
-    docs/reference/metrics.md explains the columns. Rows that a resumed run repeated from its checkpoint on replace the
-    earlier ones.
+    docs/reference/metrics.md explains the columns. Rows that a resumed run has undone are left out.
 
     Raises RunDataError if the directory has no metrics.
     """
-    metrics = read_run(one_run(Path(directory))).metrics
-    newest = not_repeated(metrics[ENV_STEPS])
-    return {name: column[newest] for name, column in metrics.items()}
-
-
-def not_repeated(x: np.ndarray) -> np.ndarray:
-    """Return which rows a resumed run did not repeat, [rows] bool: after them x, [rows], is always larger."""
-    least_later = np.append(np.minimum.accumulate(x[::-1])[::-1][1:], np.inf)
-    return x < least_later
+    return dict(read_run(one_run(Path(directory))).metrics)
 
 
 def _settings(path: Path) -> dict[str, Any]:
@@ -249,7 +241,9 @@ def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     if not rows:
         raise RunDataError(nothing)
     values = [_numbers(path, number, row, len(header)) for number, row in enumerate(rows, start=2)]
-    return dict(zip(header, np.array(values).T, strict=True))
+    found = dict(zip(header, np.array(values).T, strict=True))
+    kept = lasting(*(found[name] for name in (ENV_STEPS, SECONDS) if name in found))
+    return {name: column[kept] for name, column in found.items()}
 
 
 def _numbers(path: Path, line: int, row: Sequence[str], cells: int) -> list[float]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from daedalus.cli.comparing.comparison import Comparison, Estimate, GroupResult
 from daedalus.cli.logs import printable
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.texts import exact_number, short_number
 
 _FEW = 5  # runs
 
@@ -29,7 +29,8 @@ def header(comparison: Comparison) -> list[str]:
     names = ["group", "runs", "final return"]
     threshold = comparison.threshold
     if threshold is not None:
-        names += ["reached", f"env_steps to {threshold:g}", f"minutes to {threshold:g}"]
+        shown = exact_number(threshold)
+        names += ["reached", f"env_steps to {shown}", f"minutes to {shown}"]
     if len(comparison.results) > 1:
         names.append("P(> first)")
     return names
@@ -114,4 +115,4 @@ def as_csv(comparison: Comparison) -> str:
 
 
 def _blank(numbers: Sequence[float | None]) -> list[str]:
-    return ["" if number is None or math.isnan(number) else f"{number:.10g}" for number in numbers]
+    return ["" if number is None or math.isnan(number) else exact_number(number) for number in numbers]

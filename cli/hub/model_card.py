@@ -56,13 +56,19 @@ def _metadata(record: RunRecord, spec: RunSpec, repository: str) -> str:
     metrics: list[tuple[str, str, Any]] = []
     if record.evaluation is not None:
         statistics = episode_statistics(record.evaluation)
-        metrics.append(("mean_reward", "mean_reward", f"{statistics.mean.value:.2f} +/- {statistics.std:.2f}"))
+        metrics.append(
+            (
+                "mean_reward",
+                "mean_reward",
+                f"{_plain_number(statistics.mean.value)} +/- {_plain_number(statistics.std)}",
+            )
+        )
         if statistics.interquartile is not None:
             middle = statistics.interquartile
             name = f"interquartile mean of {record.evaluation.episodes} episodes"
             if middle.low == middle.low:
-                name += f" (95 % interval {middle.low:.2f} to {middle.high:.2f})"
-            metrics.append(("interquartile_mean_reward", name, round(middle.value, 2)))
+                name += f" (95 % interval {_plain_number(middle.low)} to {_plain_number(middle.high)})"
+            metrics.append(("interquartile_mean_reward", name, middle.value))
     results = [
         EvalResult(
             task_type=_TASK,
@@ -83,6 +89,11 @@ def _metadata(record: RunRecord, spec: RunSpec, repository: str) -> str:
         eval_results=results or None,
     )
     return data.to_yaml().strip()
+
+
+def _plain_number(value: float) -> str:
+    """Return a number for a reader that computes with it, without separators: 433.75, 1000001.00 or 2e-05."""
+    return f"{value:.2f}" if value == 0.0 or 1.0 <= abs(value) < 1e15 else f"{value:.3g}"
 
 
 def _video(video: str | None) -> str:

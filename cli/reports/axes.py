@@ -1,10 +1,13 @@
 """Axes of a chart: ticks at round numbers, their labels, and positions in the picture. Pure functions."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from daedalus.protocol.texts import short_number
 
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 _SUFFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
@@ -34,7 +37,7 @@ def axis(low: float, high: float, begin: float, end: float, *, count: int, whole
       count: the most ticks.
       whole_steps: begin and end the axis at a tick.
     """
-    if not high - low > 1e-9 * max(abs(low), abs(high), 1e-30):
+    if not high - low > 1e-12 * max(abs(low), abs(high), 1e-30):  # of equal numbers, apart from rounding
         margin = abs(low) * 0.5 or 1.0
         low, high = low - margin, high + margin
     step = _step(high - low, count)
@@ -51,20 +54,20 @@ def _step(span: float, count: int) -> float:
     return next((power * step for step in _STEPS if span / (power * step) <= count), power * 10.0)
 
 
-def label(value: float) -> str:
-    """Return a number in few characters: 1500000 as 1.5M, 0.00025 as 0.00025, 1e-7 as 1e-07."""
-    if abs(value) < 1e-12:
-        return "0"
+def labels(ticks: Sequence[float]) -> list[str]:
+    """Return numbers in few characters, but no two alike: 1500000 as 1.5M, 0.00025 as 0.00025, 1e-7 as 1e-07."""
+    step = min((b - a for a, b in itertools.pairwise(ticks)), default=0.0)
+    largest = max(map(abs, ticks), default=0.0)
+    digits = max(4, math.ceil(math.log10(largest / step)) + 1) if 0.0 < step < largest else 4
     for size, suffix in _SUFFIXES:
-        if abs(value) >= size * (10 if suffix == "k" else 1):
-            return f"{value / size:.4g}{suffix}"
-    return f"{value:.4g}"
+        if digits <= 6 and largest >= size * (10 if suffix == "k" else 1):
+            return ["0" if abs(tick) < step * 1e-6 else f"{tick / size:.{digits}g}{suffix}" for tick in ticks]
+    return ["0" if abs(tick) < max(step * 1e-6, 1e-300) else f"{tick:.{digits}g}" for tick in ticks]
 
 
 def written(value: float | None) -> str:
-    """Return a number for a text or a table cell; `-` for None and NaN."""
+    """Return a number for a text or a table cell, whole ones without a point; `-` for None and NaN."""
     if value is None or math.isnan(value):
         return "-"
-    if abs(value) >= 1e4 or (float(value).is_integer() and abs(value) >= 10):
-        return f"{value:,.0f}"
-    return f"{value:,.1f}" if abs(value) >= 10 else f"{value:.3g}"
+    whole = 10 <= abs(value) < 1e15 and float(value).is_integer()
+    return f"{value:,.0f}" if whole else short_number(value)

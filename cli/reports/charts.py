@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.cli.reports.axes import Axis, axis, label, written
+from daedalus.cli.reports.axes import Axis, axis, labels, written
 from daedalus.cli.reports.markup import Child, Html, element
 
 SERIES_COLOURS = 8  # of style.css; further series repeat them with dashes
 
 _WIDTH, _HEIGHT = 520.0, 220.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, 508.0, 10.0, 184.0
+_DIGIT_WIDTH = 7.0  # at most, of a label
 _MOST_POINTS = 400
 _MOST_BINS = 40
 
@@ -51,7 +52,7 @@ def line_chart(title: str, series: Sequence[Series], *, unit: str, colours: Sequ
         f"{each.name + ': ' if len(series) > 1 else ''}from {written(float(each.y[0]))} to {written(float(each.y[-1]))}"
         for each in series[:SERIES_COLOURS]
     )
-    return _figure(title, f"{title} by {unit}: {ends}", [_grid(x, y, unit), drawn])
+    return _figure(title, f"{title} by {unit}: {ends}", [_grid(x, y, unit), drawn], y)
 
 
 def histogram(title: str, values: np.ndarray, *, marks: Sequence[tuple[str, float]], unit: str) -> Html:
@@ -79,23 +80,26 @@ def histogram(title: str, values: np.ndarray, *, marks: Sequence[tuple[str, floa
     ]
     named = ", ".join(f"{name} {written(at)}" for name, at in marks)
     text = f"{title}: {len(values):,} from {written(values.min())} to {written(values.max())}, {named}"
-    return _figure(title, text, [_grid(x, y, unit), bars, lines])
+    return _figure(title, text, [_grid(x, y, unit), bars, lines], y)
 
 
 def _edges(values: np.ndarray) -> np.ndarray:
     """Return the edges of bins that hold all values: twice as many as Sturges' rule has, or one for equal values."""
     low, high = _extent([values])
-    if high - low <= 1e-9 * max(abs(low), abs(high)):
+    if high - low <= 1e-12 * max(abs(low), abs(high)):
         margin = max(0.5, 1e-6 * abs(low))
         return np.array([low - margin, high + margin])
     return np.linspace(low, high, min(2 * math.ceil(math.log2(len(values)) + 2), _MOST_BINS) + 1)
 
 
-def _figure(title: str, description: str, content: Sequence[Child]) -> Html:
+def _figure(title: str, description: str, content: Sequence[Child], y: Axis) -> Html:
+    left = min(_LEFT - 6 - _DIGIT_WIDTH * max(map(len, labels(y.ticks))), 0.0)  # of the longest label
     return element(
         "figure",
         element("figcaption", title),
-        element("svg", content, viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}", role="img", aria_label=description),
+        element(
+            "svg", content, viewBox=f"{left:g} 0 {_WIDTH - left:g} {_HEIGHT:g}", role="img", aria_label=description
+        ),
         class_="chart",
     )
 
@@ -103,14 +107,14 @@ def _figure(title: str, description: str, content: Sequence[Child]) -> Html:
 def _grid(x: Axis, y: Axis, unit: str) -> list[Html]:
     """Return the grid with the labels of its ticks."""
     lines = []
-    for tick in y.ticks:
+    for tick, label in zip(y.ticks, labels(y.ticks), strict=True):
         at = _short(y.at(tick))
         lines.append(element("line", x1=_LEFT, x2=_RIGHT, y1=at, y2=at, class_="grid"))
-        lines.append(element("text", label(tick), x=_LEFT - 6, y=float(at) + 4, text_anchor="end"))
-    for tick in x.ticks:
+        lines.append(element("text", label, x=_LEFT - 6, y=float(at) + 4, text_anchor="end"))
+    for tick, label in zip(x.ticks, labels(x.ticks), strict=True):
         at = _short(x.at(tick))
         lines.append(element("line", x1=at, x2=at, y1=_BOTTOM, y2=_BOTTOM + 4, class_="grid"))
-        lines.append(element("text", label(tick), x=at, y=_BOTTOM + 17, text_anchor="middle"))
+        lines.append(element("text", label, x=at, y=_BOTTOM + 17, text_anchor="middle"))
     lines.append(element("text", unit, x=_RIGHT, y=_HEIGHT - 4, text_anchor="end", class_="unit"))
     return lines
 
@@ -155,10 +159,11 @@ def _extent(parts: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def _thinned(series: Series) -> Series:
-    """Return a series with at most _MOST_POINTS points, each the mean of its neighbours."""
+    """Return a series with at most _MOST_POINTS points: the ends, and between them means of neighbours."""
     if len(series.x) <= _MOST_POINTS:
         return series
-    starts = np.linspace(0, len(series.x), _MOST_POINTS, endpoint=False).astype(np.int64)
+    inner = np.linspace(1, len(series.x) - 1, _MOST_POINTS - 2, endpoint=False).astype(np.int64)
+    starts = np.concatenate([[0], inner, [len(series.x) - 1]])
     counts = np.diff(np.append(starts, len(series.x)))
 
     def mean(values: np.ndarray | None) -> np.ndarray | None:

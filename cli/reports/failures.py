@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from daedalus.cli.reports.run_record import RunRecord
-from daedalus.learner.run.event_file import RESTARTED, RecordedEvent
+from daedalus.learner.run.event_file import RESTARTED, RESUMED, RecordedEvent
 
 _FAILED = {"left", "refused", "failed", "rejected", "quarantined", RESTARTED}
-_SAVED = "checkpoint saved"  # begin of the text of a checkpoint that did not fail
+_NO_FAILURES = ("checkpoint saved", RESUMED)  # begin of the texts of checkpoints that did not fail
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +41,7 @@ def failed_events(events: Sequence[RecordedEvent]) -> list[RecordedEvent]:
             ended = True
         elif event.kind == "left":
             failed += [] if ended else [event]
-        elif event.kind in _FAILED or (event.kind == "checkpoint" and not event.text.startswith(_SAVED)):
+        elif event.kind in _FAILED or (event.kind == "checkpoint" and not event.text.startswith(_NO_FAILURES)):
             failed.append(event)
     return failed
 

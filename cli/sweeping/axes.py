@@ -35,8 +35,9 @@ class Range:
         return self.low > 0.0 and self.high / self.low > _LOG_FACTOR
 
     def written(self, value: float) -> str:
-        """Return a value of the range in at most four digits, as it is written after `=`."""
-        rounded = round(value) if self.whole else float(f"{value:.4g}")
+        """Return a value of the range, to a thousandth of the range or four digits, as it is written after `=`."""
+        narrow = max(abs(self.low), abs(self.high)) / (self.high - self.low)  # a range from 1e6 to 1e6 + 1 needs more
+        rounded = round(value) if self.whole else float(f"{value:.{4 + int(math.log10(max(narrow, 1.0)))}g}")
         bounded = min(max(rounded, self.low), self.high)
         return str(int(bounded)) if self.whole else repr(bounded)
 

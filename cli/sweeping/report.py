@@ -76,5 +76,5 @@ def _result(run: PlannedRun, end: SweepEnd) -> list[object]:
     except RunDataError as error:
         return [str(error), "", "", "", ""]
     summary = recorded.summary
-    minutes = f"{summary.get('wall_seconds', 0.0) / 60.0:.4g}"
+    minutes = summary.get("wall_seconds", 0.0) / 60.0
     return ["done", recorded.evaluation, summary.get("env_steps"), minutes, summary.get("solved")]

@@ -6,16 +6,21 @@ import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import compress, islice
 from pathlib import Path
 
+import numpy as np
+
 from daedalus.learner.reporting.metrics import COLUMNS, Details
+from daedalus.learner.reporting.metrics_file import lasting, numbers
 from daedalus.policy.saving.replacing import replacing
+from daedalus.protocol.texts import exact_number
 
 _BLOCK_BYTES = 1 << 16
 
 
 class CsvWriter:
-    """Writer that appends one line for each row. A resumed run continues its file.
+    """Writer that appends one line for each row. A resumed run continues its file, after `cut_rows`.
 
     Lines are complete: one that was written in part, because the disk was full or the machine crashed, is removed. A
     row with new columns, such as the first scalar of the environment's info, adds them to the header, for which the
@@ -37,7 +42,7 @@ class CsvWriter:
         new = [name for name in row if name not in self._columns]
         if new:
             self._add_columns(new)
-        self._append([_cell(row.get(name)) for name in self._columns])
+        self._append([exact_number(row.get(name)) for name in self._columns])
 
     def _append(self, cells: Sequence[str]) -> None:
         data = _line(cells)
@@ -66,6 +71,26 @@ class CsvWriter:
     def close(self) -> None:
         """Close the file. See MetricsWriter."""
         self._file.close()
+
+
+def cut_rows(path: Path, env_steps: int) -> list[dict[str, float]]:
+    """Remove the rows that a run undoes when it continues at `env_steps`, and return them; and those undone before.
+
+    Raises OSError.
+    """
+    if not path.exists():
+        return []
+    _remove_partial_line(path)
+    columns = list(_header(path))
+    read = [numbers(columns, list(cells)) for cells in islice(_rows(path), 1, None)]
+    steps, seconds = (np.array([row.get(name, np.nan) for row in read]) for name in ("env_steps", "wall_seconds"))
+    newest, undone = lasting(steps, seconds), steps > env_steps
+    kept = newest & ~undone
+    if not kept.all():
+        with replacing(path) as beside, open(beside, "wb") as new:
+            new.write(_line(columns))
+            new.writelines(_line(cells) for cells in compress(islice(_rows(path), 1, None), kept))
+    return list(compress(read, newest & undone))
 
 
 def _line(cells: Sequence[str]) -> bytes:
@@ -104,7 +129,3 @@ def _rows(path: Path) -> Iterator[Sequence[str]]:
             yield from csv.reader(file)
         except csv.Error as error:
             raise OSError(errno.EILSEQ, f"{path.name} is damaged ({error}): move it away", str(path)) from None
-
-
-def _cell(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Mapping
 
+from daedalus.protocol.texts import exact_number, short_number
+
 _BASELINE_EPISODES = 20  # after so many, the policy is still about as random as at the start,
 _BASELINE_PROGRESS = 0.05  # unless they took more than this share of the budget
 _JUDGED_PROGRESS, _WATCHED_PROGRESS = 0.2, 0.1  # shares of the budget: of the judgement, and of the rows that count
@@ -69,12 +71,13 @@ class LearningHint:
                 return ""
         if self._lowest == self._highest:
             return (
-                f"this run has nothing to learn from: every episode so far has the return {self._lowest:.4g}, so that "
+                "this run has nothing to learn from: every episode so far has the return "
+                f"{exact_number(self._lowest)}, so that "
                 "no action was better than another; check the reward, and whether random actions can reach the goal"
             )
         first, entropy = self._first_entropy or 0.0, row.get("entropy", 0.0)
-        returns = f"after a fifth of the budget the mean return is {row['episode_return_mean']:.4g}"
-        returns += f", and was {self._first_return[0]:.4g} at the start"
+        returns = f"after a fifth of the budget the mean return is {short_number(row['episode_return_mean'])}"
+        returns += f", and was {short_number(self._first_return[0])} at the start"
         if first > 0.0 and entropy < _COLLAPSED * first:
             return (
                 f"this run does not learn: {returns}, and the entropy fell from {first:.3g} to {entropy:.3g}, so the "

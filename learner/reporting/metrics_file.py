@@ -5,6 +5,8 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from daedalus.learner.reporting.metrics import MAX_COLUMNS
 
 
@@ -42,3 +44,15 @@ def numbers(columns: list[str], cells: list[str]) -> dict[str, float]:
         if math.isfinite(value):
             row[name] = value
     return row
+
+
+def lasting(*columns: np.ndarray) -> np.ndarray:
+    """Return which rows the run has kept, [rows] bool, from columns that never fall, [rows], such as env_steps.
+
+    A run that continues from a checkpoint undoes the rows after it: a later row has less. NaN: unknown.
+    """
+    kept = np.ones(len(columns[0]), np.bool_)
+    for column in columns:
+        least_later = np.fmin.accumulate(np.append(column, np.inf)[::-1])[::-1][1:]
+        kept &= ~(column > least_later)
+    return kept

@@ -1,16 +1,22 @@
 """Records of a run: rows of metrics, events and the summary. A disk error is logged and does not end the run."""
 
 import logging
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daedalus.learner.reporting.csv_writer import cut_rows
 from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
-from daedalus.learner.run.event_file import EventFile
-from daedalus.learner.run.run_directory import METRICS, SUMMARY, write_json
+from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
+from daedalus.learner.run.event_file import RESUMED, EventFile
+from daedalus.learner.run.run_directory import EVALUATION, METRICS, SUMMARY, read_json, write_json
 from daedalus.learner.run.run_state import RunState
+from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.metrics_history import MetricsHistory
+from daedalus.policy.saving.best_checkpoints import set_aside_newer
 
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
@@ -68,11 +74,40 @@ class RunRecords:
             _logger.warning("summary not written: %s", error.strerror)
 
 
-def load_history(state: RunState, history: MetricsHistory) -> None:
-    """Add the rows of the learner processes before, as far as the checkpoint that the run continues from."""
+def continue_records(state: RunState, policy_version: int, history: MetricsHistory, events: EventLog) -> None:
+    """Undo what the learner processes before recorded after the checkpoint of this policy version; read the rest.
+
+    Rows of the metrics and best checkpoints of env_steps that the run makes again would be those of other weights.
+    """
+    directory, env_steps = state.directory, state.counters.env_steps
     try:
-        for row in read_rows(state.directory / METRICS):
-            if row["env_steps"] <= state.counters.env_steps:
-                history.add(row)
+        rows = cut_rows(directory / METRICS, env_steps)
+        if rows:
+            writer = TensorBoardWriter(directory)
+            writer.purge(env_steps)
+            writer.close()
+            state.evaluations.carry_over(rows)
+        undone = [f"{len(rows):,} rows of {METRICS}"] if rows else []
+        undone += [f"{each.name}, whose policy is kept" for each in set_aside_newer(directory, policy_version)]
+        undone += _remove_later_results(directory, env_steps, policy_version)
+        if undone:
+            text = f"continues at {env_steps:,} env_steps: undone are {', '.join(undone)}"
+            events.add("checkpoint", f"{RESUMED}{text}")
+        for row in read_rows(directory / METRICS):
+            history.add(row)
+    except FileNotFoundError:
+        return  # no row yet
     except (OSError, ValueError) as error:
         _logger.warning("the metrics before the checkpoint cannot be read: %s", error)
+
+
+def _remove_later_results(directory: Path, env_steps: int, policy_version: int) -> list[str]:
+    """Remove the results of a run that had come further than the checkpoint, and return their names."""
+    removed = []
+    for name, key, reached in ((SUMMARY, "env_steps", env_steps), (EVALUATION, "policy_version", policy_version)):
+        with suppress(SettingsError):  # missing, or damaged: others say so
+            later = read_json(directory / name).get(key)
+            if isinstance(later, int) and later > reached:
+                (directory / name).unlink()
+                removed.append(name)
+    return removed

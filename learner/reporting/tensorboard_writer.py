@@ -16,7 +16,7 @@ from daedalus.learner.reporting.metrics import Details, tag
 
 _BINS = 30  # of returns and lengths
 _MOST_BINS = 256  # of actions
-_SMALLEST_RANGE = 1e-9  # of values, relative to the largest: a float has few numbers within a smaller one
+_SMALLEST_RANGE = 1e-12  # of values, relative to the largest: a float has few numbers within a smaller one
 
 
 class TensorBoardWriter:
@@ -35,6 +35,7 @@ class TensorBoardWriter:
 
         # protobuf creates these classes at import, so a type checker cannot find them.
         self._event: Any = vars(event_pb2)["Event"]
+        self._session_log: Any = vars(event_pb2)["SessionLog"]
         self._summary: Any = vars(summary_pb2)["Summary"]
         self._histogram_proto: Any = vars(summary_pb2)["HistogramProto"]
         now = time.time()
@@ -69,6 +70,11 @@ class TensorBoardWriter:
         if details.picture is not None:
             values.append(self._summary.Value(tag="rollout/observation", image=self._image(details.picture)))
         self._add(self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values)))
+
+    def purge(self, env_steps: int) -> None:
+        """Let TensorBoard forget what earlier files have after `env_steps`: the run goes on from there."""
+        status = self._session_log(status=self._session_log.START)
+        self._add(self._event(wall_time=time.time(), step=env_steps + 1, session_log=status))
 
     def _add(self, event: Any) -> None:
         self._writer.write(event.SerializeToString())

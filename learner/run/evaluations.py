@@ -3,6 +3,7 @@
 The checkpoint of a policy is kept while an evaluator plays the policy. The best checkpoints are kept permanently.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 from daedalus.protocol.texts import short_number
+from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER
 
 _MAX_IN_PROGRESS = 16
 
@@ -31,6 +33,12 @@ class Evaluations:
     def checkpoints_in_use(self) -> set[Path]:
         """Directories of the checkpoints that must not be pruned."""
         return {directory for directory, _, _ in self.in_progress.values()}
+
+    def carry_over(self, undone: Sequence[Mapping[str, float]]) -> None:
+        """Keep, from rows that a resumed run undoes, the newest evaluation of a policy up to its checkpoint."""
+        for row in undone:
+            if row.get("evaluation_env_steps", np.inf) <= self.counters.env_steps:
+                self.newest = {name: value for name, value in row.items() if name.startswith("evaluation_")}
 
     def begin(self, evaluator: str, directory: Path, policy_version: int, env_steps: int) -> None:
         """Start the evaluation of the policy in `directory`; it replaces the evaluator's previous evaluation.
@@ -53,8 +61,10 @@ class Evaluations:
         if directory is None or version != report.policy_version:
             reason = f"evaluator {report.evaluator!r} has no evaluation of policy version {report.policy_version}"
             return Acknowledgement(verdict="rejected", reason=reason), ""
-        if not np.isfinite(report.returns).all():
-            return Acknowledgement(verdict="rejected", reason="returns has a value that is not finite"), ""
+        if not (np.abs(report.returns) <= LARGEST_EPISODE_NUMBER).all():
+            return Acknowledgement(
+                verdict="rejected", reason="returns has a value that is not finite, or too large"
+            ), ""
         if (report.lengths < 1).any():
             return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), ""
         del self.in_progress[report.evaluator]

@@ -17,6 +17,7 @@ from daedalus.protocol.status import Event
 from daedalus.protocol.timestamps import utc
 
 RESTARTED = "restarted"
+RESUMED = "resumed: "  # begin of the text of the event "checkpoint" of a run that undoes what came after it
 _MAX_BYTES = 1 << 20  # later events are left out
 _MAX_TEXT = 300  # characters
 

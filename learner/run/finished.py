@@ -9,6 +9,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import exact_number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,8 +37,8 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
     solved = counters.is_solved(spec) and bool(summary.get("solved"))  # not while new episodes have to confirm it
     if solved and training.stop_when_solved:
         reason = (
-            f"the target return {training.target_return:g} was reached, and {counters.env_steps:,} env_steps are done: "
-            "train on with --set training.stop_when_solved=false, or raise training.target_return"
+            f"the target return {exact_number(training.target_return)} was reached, and {counters.env_steps:,} "
+            "env_steps are done: train on with --set training.stop_when_solved=false, or raise training.target_return"
         )
     elif counters.env_steps >= training.env_steps:
         reason = (

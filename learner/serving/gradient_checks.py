@@ -15,6 +15,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import (
     DIAGNOSTICS,
+    LARGEST_EPISODE_NUMBER,
     LARGEST_GRADIENT_NORM,
     LOSS_TERMS,
     MAX_INFO_NAMES,
@@ -148,13 +149,13 @@ def _metrics_violation(gradient: Gradient) -> str:
 def _episodes_violation(gradient: Gradient) -> str:
     if len(gradient.episode_returns) > gradient.env_steps:
         return f"{len(gradient.episode_returns)} episodes ended in {gradient.env_steps} env_steps"
-    if not np.isfinite(gradient.episode_returns).all():
-        return "episode_returns has a value that is not finite"
+    if not (np.abs(gradient.episode_returns) <= LARGEST_EPISODE_NUMBER).all():
+        return "episode_returns has a value that is not finite, or too large"
     if (gradient.episode_lengths < 1).any():
         return "episode_lengths has a value below 1"
     for name, values in gradient.episode_info.items():
-        if not np.isfinite(values).all():
-            return f"episode_info {name!r} has a value that is not finite"
+        if not (np.abs(values) <= LARGEST_EPISODE_NUMBER).all():
+            return f"episode_info {name!r} has a value that is not finite, or too large"
     return ""
 
 

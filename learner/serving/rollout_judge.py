@@ -19,7 +19,7 @@ from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.spaces import LARGEST_REWARD, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import bounded_text
-from daedalus.protocol.uploads import MAX_INFO_NAMES, Gradient, Rollout, Upload
+from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER, MAX_INFO_NAMES, Gradient, Rollout, Upload
 
 # Per environment and row, besides observations, actions and masks, rounded up; integers may be sent in 8 bytes each.
 _ROW_BYTES, _INTEGER_BYTES = 24, 8
@@ -35,7 +35,7 @@ _LARGEST = {
     "initial_state": 1.001,
     "behaviour_log_probs": 1e6,
     "rewards": LARGEST_REWARD,
-    "episode_returns": math.inf,
+    "episode_returns": LARGEST_EPISODE_NUMBER,
 }
 _REMEDIES = {
     "rewards": ": set environment.reward_scale",
@@ -240,8 +240,8 @@ def _number_violation(rollout: Rollout) -> str:
         if max(-low, high) > largest:
             return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
     for name, values in rollout.episode_info.items():
-        if not np.isfinite(values).all():
-            return f"episode_info {name!r} has a value that is not finite"
+        if not (np.abs(values) <= LARGEST_EPISODE_NUMBER).all():
+            return f"episode_info {name!r} has a value that is not finite, or too large"
     return ""
 
 

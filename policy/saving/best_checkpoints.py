@@ -56,6 +56,21 @@ def keep_if_best(checkpoint: Path, score: float, policy_version: int) -> bool:
     return rank == 0
 
 
+def set_aside_newer(run_directory: Path, policy_version: int) -> list[Path]:
+    """Rename the checkpoints that have a score and a higher version than that from which a run continues.
+
+    The run makes these versions again, with other weights. Returns the new paths. Raises OSError.
+    """
+    renamed = []
+    for checkpoint in best_checkpoints(run_directory):
+        if _score_and_version(checkpoint)[1] > policy_version:
+            aside = checkpoint.with_name(f"undone_{checkpoint.name}")
+            if aside.exists():
+                shutil.rmtree(aside)
+            renamed.append(checkpoint.rename(aside))
+    return renamed
+
+
 def rescore(checkpoint: Path, score: float, policy_version: int) -> Path:
     """Give a checkpoint another score and return its new path. Raises OSError if writing fails."""
     target = checkpoint.with_name(best_name(score, policy_version))

@@ -27,7 +27,7 @@ def test_scalars_of_ended_episodes_are_taken_once() -> None:
     scalars.add({"laps": np.array([5.5, 6.5, 7.5, 8.5])}, np.array([False, True, False, False]))
     scalars.add({"laps": np.array([9, 9, 9, 9])}, np.zeros(4, np.bool_))
     (name,), (values,) = zip(*scalars.take().items(), strict=True)
-    assert (name, values.dtype, values.tolist()) == ("laps", np.float32, [1.0, 3.0, 4.0, 6.5])
+    assert (name, values.dtype, values.tolist()) == ("laps", np.float64, [1.0, 3.0, 4.0, 6.5])
     assert scalars.take() == {}
 
 

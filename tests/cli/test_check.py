@@ -22,7 +22,7 @@ def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFi
     lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if "note" not in line)
     assert lines["environment"] == "faulty_environments:Faulty-v0 of gymnasium"
     assert lines["spaces"] == "observation: float32 array of shape (2,); action: 2 choices"
-    assert "ended, after 10 to 10 env_steps; return 10 to 10, mean 10" in lines["episodes"]
+    assert "ended, after 10 to 10 env_steps; return 10.0 to 10.0, mean 10.0" in lines["episodes"]
     assert "ms a step" in lines["speed"]
     assert lines["train"].startswith("a2c, 2 actors x 8 environments, rollouts of 16 rows, 1,000,000 env_steps")
     assert lines["network"] == "encoder mlp, 8,907 parameters"

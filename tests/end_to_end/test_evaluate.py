@@ -100,6 +100,18 @@ def test_episodes_are_not_cut_by_the_no_reward_limit(tmp_path: Path, evaluate: C
     assert evaluate(run, "--episodes", 2, "--envs", 2)["lengths"] == [3, 3]
 
 
+@pytest.mark.parametrize("reward", [1_000_001.0, 2e-5 / 3, 16_777_217.0, -1e9 - 1, 0.1])
+def test_returns_are_exact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, evaluate: Callable[..., dict], reward: float
+) -> None:
+    """In single precision, or with four decimals, each of them would be another number."""
+    step = Counting.step
+    monkeypatch.setattr(Counting, "step", lambda *given: (*(made := step(*given))[:1], reward / 4, *made[2:]))
+    run = save(tmp_path / "run", COUNTING, 3)
+    result = evaluate(run, "--episodes", 1)
+    assert result["returns"] == [reward / 4 * result["lengths"][0]] == [result["return_mean"]]
+
+
 @pytest.mark.parametrize("memory", ["none", "gru"])
 def test_the_returns_equal_those_of_episodes_played_one_by_one(
     tmp_path: Path, evaluate: Callable[..., dict], memory: str

@@ -11,8 +11,9 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-from daedalus.learner.reporting.csv_writer import CsvWriter
+from daedalus.learner.reporting.csv_writer import CsvWriter, cut_rows
 from daedalus.learner.reporting.metrics import COLUMNS, Details, tag
+from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.training.update_metrics import METRICS
 
@@ -31,7 +32,42 @@ def test_csv_has_a_header_and_a_line_for_each_row_with_blank_unknown_values(tmp_
     writer.close()
     assert tuple(row) == COLUMNS
     known = {name: text for name, text in row.items() if text}
-    assert known == {"env_steps": "12345678", "wall_seconds": "1.23457", "policy_loss": "-1e-09"}
+    assert known == {"env_steps": "12345678", "wall_seconds": "1.23456789", "policy_loss": "-1e-09"}
+
+
+@pytest.mark.parametrize(
+    "value", [1_000_001.0, 1234567.0, 16_777_217.0, 1e9 + 1, 2e-5 / 3, 1e-9, -0.1, 1e22, np.float64(1 / 3), 2**53 - 1]
+)
+def test_numbers_are_exact_in_the_csv(tmp_path: Path, value: float) -> None:
+    with closing(CsvWriter(tmp_path / "metrics.csv")) as writer:
+        writer.write({"env_steps": 2**33 + 1, "user/score": value, "episode_return_mean": value}, NONE)
+    (row,) = read_rows(tmp_path / "metrics.csv")
+    assert row == {"env_steps": 2**33 + 1, "user/score": value, "episode_return_mean": value}
+
+
+def test_rows_after_the_checkpoint_are_cut_and_those_that_an_earlier_release_left(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    with closing(CsvWriter(path)) as writer:
+        for seconds, env_steps in ((1, 10), (2, 90), (3, 95), (2.5, 97), (4, 20), (5, 30), (6, 40), (7, 50)):
+            writer.write({"wall_seconds": seconds, "env_steps": env_steps, "user/score": 2.0}, NONE)
+    assert [row["env_steps"] for row in cut_rows(path, 45)] == [50]
+    assert [row["env_steps"] for row in read_rows(path)] == [10, 20, 30, 40]
+    before = path.read_bytes()
+    assert cut_rows(path, 45) == cut_rows(tmp_path / "none.csv", 45) == []
+    assert path.read_bytes() == before
+
+
+def test_tensorboard_forgets_what_a_resumed_run_has_undone(tmp_path: Path) -> None:
+    for first, rows in ((None, (10, 20, 30)), (20, (25, 30))):
+        with closing(TensorBoardWriter(tmp_path)) as writer:
+            if first is not None:
+                writer.purge(first)
+            for env_steps in rows:
+                writer.write({"env_steps": env_steps, "entropy": env_steps + (first or 0)}, NONE)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [(each.step, each.value) for each in events.Scalars("train/entropy")] == [
+        *((10, 10), (20, 20), (25, 45), (30, 50)),
+    ]
 
 
 def test_csv_continues_after_a_resume_without_a_second_header(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from daedalus.learner.reporting.csv_writer import CsvWriter
+from daedalus.learner.reporting.csv_writer import CsvWriter, cut_rows
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.trackers.metrics_follower import MetricsFollower
 
@@ -25,6 +25,24 @@ def test_each_row_is_read_once_also_after_the_file_is_written_anew(tmp_path: Pat
     assert steps(follower) == []
     writer.close()
     assert steps(MetricsFollower(path, follower.taken - 1)) == [4]
+
+
+def test_rows_that_a_resumed_run_makes_again_are_read_after_those_that_it_cut(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    writer = CsvWriter(path)
+    for env_steps in (1000, 2000, 3000, 4000):
+        writer.write({"env_steps": env_steps}, Details())
+    writer.close()
+    follower = MetricsFollower(path)
+    assert steps(follower) == [1000, 2000, 3000, 4000]
+    assert [row["env_steps"] for row in cut_rows(path, 2500)] == [3000, 4000]
+    assert steps(follower) == []
+    writer = CsvWriter(path)
+    writer.write({"env_steps": 2600}, Details())
+    assert steps(MetricsFollower(path, 2)) == steps(follower) == [2600]
+    writer.write({"env_steps": 3700, "env/laps": 1.0}, Details())
+    assert steps(follower) == [3700]
+    writer.close()
 
 
 def test_an_incomplete_row_is_read_when_it_is_complete(tmp_path: Path) -> None:

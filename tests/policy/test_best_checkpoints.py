@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_name, best_score, keep_if_best, rescore
+from daedalus.policy.saving.best_checkpoints import (
+    best_checkpoints,
+    best_name,
+    best_score,
+    keep_if_best,
+    rescore,
+    set_aside_newer,
+)
 
 
 def checkpoint(run: Path, version: int) -> Path:
@@ -78,6 +85,17 @@ def test_rescoring_renames_the_checkpoint(tmp_path: Path) -> None:
     (best, _) = best_checkpoints(tmp_path)
     assert rescore(best, 60.0, 2) == best
     assert scored(tmp_path) == [(60.0, "2"), (50.0, "1")]
+
+
+def test_newer_versions_than_that_of_a_resumed_run_are_no_longer_among_the_best(tmp_path: Path) -> None:
+    keep_if_best(checkpoint(tmp_path, 5), 1.0, 5)
+    keep_if_best(checkpoint(tmp_path, 7), 9.0, 7)
+    (aside,) = set_aside_newer(tmp_path, 5)
+    assert aside.name == "undone_best_9.0_0000000007"
+    assert (aside / "content").read_text() == "7"
+    assert [score for score, _ in scored(tmp_path)] == [1.0]
+    assert keep_if_best(tmp_path / "checkpoints" / f"{7:010d}", 8.0, 7)  # the version that the run makes again
+    assert set_aside_newer(tmp_path, 7) == []
 
 
 def no_links(*_: Any) -> None:

@@ -53,7 +53,7 @@ def test_array_of_another_shape_than_rewards_is_named(name: str, shape: tuple[in
         rollout(**{name: np.zeros(shape, dtype)})
 
 
-@pytest.mark.parametrize("name", [*ROW_ARRAYS, "initial_state", "episode_returns"])
+@pytest.mark.parametrize("name", [*ROW_ARRAYS, "initial_state"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float64])
 def test_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
     right = getattr(rollout(), name)
@@ -114,7 +114,7 @@ def test_empty_rollout_is_rejected(rows: int, environments: int) -> None:
 
 
 def test_rollout_with_episode_info_is_accepted() -> None:
-    info = {"x" * 64: np.zeros(K, np.float32), "lap.time_s-1": np.zeros(1, np.float32)}
+    info = {"x" * 64: np.zeros(K, np.float32), "lap.time_s-1": np.zeros(1, np.float64)}
     assert rollout(episode_info=info).episode_info == info
 
 
@@ -125,7 +125,7 @@ def test_rollout_with_episode_info_is_accepted() -> None:
         ({"x" * 65: np.zeros(1, np.float32)}, "must be 1 to 64 letters"),
         ({"a/b": np.zeros(1, np.float32)}, "must be 1 to 64 letters"),
         ({"\x1b[31m": np.zeros(1, np.float32)}, "must be 1 to 64 letters"),
-        ({"a": np.zeros(1, np.float64)}, "float32"),
+        ({"a": np.zeros(1, np.int32)}, "float32"),
         ({"a": np.zeros((1, 1), np.float32)}, "float32"),
         ({"a": np.zeros(0, np.float32)}, "from 1 to"),
         ({"a": np.zeros(K + 1, np.float32)}, "from 1 to"),
@@ -182,7 +182,15 @@ def test_report_has_a_length_for_each_return() -> None:
             report(np.zeros(returns, np.float32), np.ones(lengths, np.int32))
 
 
-@pytest.mark.parametrize(("returns", "lengths"), [("f8", "i4"), ("i4", "i4"), ("f4", "f4"), ("f4", "i8")])
+@pytest.mark.parametrize("dtype", [np.int64, np.float16])
+def test_returns_must_be_float64_or_float32(dtype: type) -> None:
+    for accepted in (np.float32, np.float64):
+        assert rollout(episode_returns=np.full(K, 16_777_217, accepted)).episode_returns.dtype == accepted
+    with pytest.raises(ValueError, match=r"^episode_returns must be float64 or float32"):
+        rollout(episode_returns=np.zeros(K, dtype))
+
+
+@pytest.mark.parametrize(("returns", "lengths"), [("f2", "i4"), ("i4", "i4"), ("f4", "f4"), ("f8", "i8")])
 def test_report_of_other_dtypes_is_rejected(returns: str, lengths: str) -> None:
-    with pytest.raises(ValueError, match=r"^returns must be float32 and lengths int32"):
+    with pytest.raises(ValueError, match=r"^returns must be float64 or float32, and lengths int32"):
         report(np.zeros(3, returns), np.ones(3, lengths))

@@ -34,7 +34,12 @@ def test_any_text_becomes_printable_and_small(text: str, most: int) -> None:
     assert bounded_text(bounded, most) == bounded.rstrip()
 
 
-SHOWN = {0.0: "0", 1.2e-5: "1.2e-05", -0.0345: "-0.0345", 0.98765: "0.988", -475.25: "-475.2", 1e6: "1,000,000"}
+SHOWN = {0.0: "0", 1.2e-5: "1.2e-05", -0.0345: "-0.0345", 0.98765: "0.988", -475.25: "-475.2", 1e6: "1,000,000"} | {
+    1_000_001.0: "1,000,001",
+    2e-5: "2e-05",
+    1e300: "1e+300",
+    -0.0: "0",
+}
 
 
 @pytest.mark.parametrize(("value", "text"), SHOWN.items())

@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from daedalus.learner.reporting.metrics_file import numbers
 
@@ -10,8 +11,8 @@ from daedalus.learner.reporting.metrics_file import numbers
 class MetricsFollower:
     """Reader of the complete rows of a metrics.csv that grows. It keeps no file open between two calls.
 
-    If a row has new columns, the writer of the file writes it anew, with all rows so far. A resumed run appends rows
-    that begin again at its checkpoint.
+    If a row has new columns, the writer of the file writes it anew, with all rows so far. A resumed run writes it anew
+    without the rows after its checkpoint, and appends rows that begin again there.
     """
 
     def __init__(self, path: Path, taken: int = 0) -> None:
@@ -20,6 +21,7 @@ class MetricsFollower:
         self.taken = taken  # number of rows that were read, and whose use has ended without an exception
         self._header = b""
         self._at = 0  # bytes, after the rows that were taken
+        self._last = b""  # line before there
 
     @property
     def exist(self) -> bool:
@@ -34,10 +36,11 @@ class MetricsFollower:
             header = file.readline()
             if not header.endswith(b"\n"):
                 return
-            if header != self._header:
-                self._header, self._at = header, file.tell()
-                for _ in range(self.taken):
-                    self._at += len(file.readline())
+            if header != self._header or not self._is_at_last(file):
+                file.seek(len(header))
+                lines = [line for _, line in zip(range(self.taken), file, strict=False) if line.endswith(b"\n")]
+                self._header, self._at = header, len(header) + sum(map(len, lines))
+                self._last, self.taken = (lines or [header])[-1], len(lines)
             columns = _cells(header)
             file.seek(self._at)
             while (line := file.readline()).endswith(b"\n"):
@@ -45,6 +48,12 @@ class MetricsFollower:
                 yield row if "env_steps" in row else {}
                 self.taken += 1
                 self._at += len(line)
+                self._last = line
+
+    def _is_at_last(self, file: BinaryIO) -> bool:
+        """Return whether the line before the position is still the one that was taken last."""
+        file.seek(self._at - len(self._last))
+        return file.read(len(self._last)) == self._last
 
 
 def _cells(line: bytes) -> list[str]:

@@ -1,13 +1,17 @@
 """Test of cli/comparing/curves.py."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from recorded_runs import record
 
-from daedalus.cli.comparing.curves import group_curve, points
+from daedalus.cli.comparing.curves import evaluations, group_curve, points
 from daedalus.cli.comparing.recorded_run import RETURN, RecordedRun, read_run
+from daedalus.learner.reporting.csv_writer import CsvWriter
+from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.run.run_directory import METRICS
 
 
 def run(folder: Path, name: str, **content: Any) -> RecordedRun:
@@ -63,3 +67,21 @@ def test_a_run_without_a_value_has_no_curve(tmp_path: Path) -> None:
     assert (
         group_curve([run(tmp_path, "a", returns=(None, None, None)), run(tmp_path, "b")], RETURN, "env_steps") is None
     )
+
+
+def test_evaluations_of_an_undone_part_are_left_out_and_the_others_run_forwards(tmp_path: Path) -> None:
+    """In the files of earlier releases, which kept the rows that a killed run had made after its checkpoint."""
+    directory = record(tmp_path / "run", returns=(1.0,), env_steps=(1000,))
+    with closing(CsvWriter(directory / METRICS)) as writer:
+        for seconds, steps, at, mean in (
+            (120, 2000, 1500, 10.0),
+            (180, 3000, 2900, 99.0),  # undone
+            (125, 2100, 1900, 20.0),
+            (130, 2200, 1800, 15.0),  # of a slower evaluator
+        ):
+            evaluation = {"evaluation_env_steps": at, "evaluation_return_mean": mean}
+            writer.write(
+                {"wall_seconds": seconds, "env_steps": steps, "episode_return_mean": 1.0, **evaluation}, Details()
+            )
+    x, y = evaluations(read_run(directory), "env_steps")
+    assert (x.tolist(), y.tolist()) == ([1500, 1800, 1900], [10.0, 15.0, 20.0])

@@ -28,6 +28,12 @@ class TestThreshold:
         assert run.reached(300.0) == (2000.0, 2.0)
         assert run.reached(481.0) == (math.inf, math.inf)
 
+    def test_large_and_small_returns_reach_it_exactly(self, tmp_path: Path) -> None:
+        for number, threshold in enumerate((1_000_001.0, 1e9 + 1, 2e-5 / 3, -1_000_001.0)):
+            below = math.nextafter(threshold, -math.inf)
+            run = read_run(record(tmp_path / str(number), returns=(below, below, threshold)))
+            assert run.reached(threshold) == (3000.0, 3.0)
+
     def test_the_mean_of_too_few_episodes_does_not_count(self, tmp_path: Path) -> None:
         run = read_run(record(tmp_path / "run", returns=(480.0, 300.0, 480.0), env_steps=(990, 2000, 3000)))
         assert run.settings["training.target_episodes"] == 100

@@ -51,6 +51,7 @@ def test_a_value_of_a_range_is_short_and_inside() -> None:
     assert axis.written(0.0034567891) == "0.003457"
     assert axis.written(0.09876539) == "0.0987654"  # rounded, it would be beyond the end
     assert Range(key="a.b", low=4, high=64, whole=True).written(5) == "5"
+    assert Range(key="a.b", low=1e6, high=1e6 + 1, whole=False).written(1_000_000.25) == "1000000.25"
 
 
 @pytest.mark.parametrize(
