@@ -21,7 +21,7 @@ from daedalus.actor.environments.environment_processes import EnvironmentProcess
 from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
 from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
 from daedalus.actor.environments.masks import has_choices
-from daedalus.actor.environments.rendering import render_without_display
+from daedalus.actor.environments.rendering import CountedSteps, render_without_display
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
@@ -70,7 +70,10 @@ class EnvironmentFactory:
                 f"environment {spec.id} cannot render {self.render_mode} images: {reason}"
             ) from None
         environment = atari.wrapped(environment, of_atari)
+        below = None
         if spec.wrap is not None:
+            if self.camera is not None:
+                environment = below = CountedSteps(environment)
             environment = _wrapped(environment, spec.wrap, self.modules)
         if environment.has_wrapper_attr("action_masks"):
             environment = MaskInInfo(environment)
@@ -81,6 +84,7 @@ class EnvironmentFactory:
                 repeat=spec.action_repeat,
                 no_reward_limit=spec.no_reward_limit,
                 camera=self.camera,
+                below=below,
             )
         if late_rendered:
             from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages

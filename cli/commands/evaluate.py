@@ -10,9 +10,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, TextIO
 
-import gymnasium
 import numpy as np
-from gymnasium.envs.registration import load_env_creator
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
@@ -39,8 +37,6 @@ from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, mod
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.texts import short_number
 
-_FRAMES_PER_SECOND = 30.0  # of environments without render_fps
-_ATARI_FRAMES_PER_SECOND = 60.0
 _FAILURES = (
     EvaluationStoppedError,
     DamagedError,
@@ -130,17 +126,21 @@ def run_evaluation(arguments: argparse.Namespace, stop: threading.Event, stream:
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
     progress = EvaluationProgress(stream, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
     filmed: dict[str, Any] = {}
+    notes: list[str] = []
     try:
         if arguments.video is None:
             evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
         else:
             with Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video:
                 evaluation = _play(policy, spec, modules, arguments, seed, progress, video)
-            filmed = {"video": str(arguments.video), "video_seconds": video.frames / video.frames_per_second}
+            filmed = {"video": str(arguments.video), "video_seconds": video.seconds}
+            if video.rate.guess:
+                notes.append(f"the speed of the video: {video.rate.guess}")
     finally:
         progress.end()
     actions = _actions(policy, arguments)
-    return {**_result(policy, spec, evaluation, actions), "seed": seed, "actions": actions, **filmed}
+    result = _result(policy, spec, evaluation, actions)
+    return {**result, "notes": [*result["notes"], *notes], "seed": seed, "actions": actions, **filmed}
 
 
 def _directory(arguments: argparse.Namespace) -> Path:
@@ -190,8 +190,6 @@ def _play(
         one_episode=True,
     )
     try:
-        if video is not None:
-            video.frames_per_second = _frames_per_second(spec)
         if environments.spaces != policy.spaces:
             raise EnvironmentSetupError(
                 f"{spec.id} (backend {spec.backend}) has {environments.spaces}; the policy was trained on "
@@ -210,16 +208,6 @@ def _play(
         )
     finally:
         environments.close()
-
-
-def _frames_per_second(spec: EnvironmentSpec) -> float:
-    """Return the frames per second at which an environment's own steps are meant to be shown."""
-    skipped = spec.kwargs.get("frameskip", 4)
-    if spec.id.startswith("ALE/") and isinstance(skipped, int):
-        return _ATARI_FRAMES_PER_SECOND / skipped  # its metadata say 30 for any frameskip
-    maker = gymnasium.spec(spec.id.rpartition(":")[2]).entry_point
-    metadata = getattr(load_env_creator(maker) if isinstance(maker, str) else maker, "metadata", {})
-    return float(metadata.get("render_fps", _FRAMES_PER_SECOND))
 
 
 def _actions(policy: SavedPolicy, arguments: argparse.Namespace) -> str:
