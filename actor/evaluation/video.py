@@ -56,7 +56,8 @@ class Video:
         self.seconds = 0.0  # that the video plays; known at the end of the block
         self._first: np.ndarray | None = None  # until the second one is there
         self._path = path
-        self._partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        # An absolute path: an environment may change the working directory before the first frame.
+        self._partial = Path(os.path.abspath(path.with_name(f".{path.name}.{os.getpid()}.partial")))
         self._width, self._max_seconds = width, max_seconds
         self._shape: tuple[int, ...] = ()
         self._encoder: _Encoder | None = None
@@ -122,7 +123,7 @@ class Video:
                 return
             if not self._close():
                 raise VideoError(f"cannot write {self._path}: no frame was recorded")
-            os.replace(self._partial, self._path)
+            os.replace(self._partial, self._partial.with_name(self._path.name))
         except OSError as failure:
             raise self._write_error(failure) from None
         finally:

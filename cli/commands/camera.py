@@ -108,6 +108,8 @@ def main(output: BinaryIO) -> int:
     add_allow_module(options, "the run")
     options.add_argument("--checkpoints", type=Path, help="run directory, for value estimates")
     arguments = options.parse_args()
+    if arguments.checkpoints is not None:  # the environment may change the working directory
+        arguments.checkpoints = Path(os.path.abspath(arguments.checkpoints))
     configure_logging("warning", as_json=False, process="camera")
     os.nice(_NICENESS)
     stop = stop_on_signals(exit_if_stuck=True)

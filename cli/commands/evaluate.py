@@ -33,6 +33,7 @@ from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.hub import HubError, RepositoryNameError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.texts import short_number
@@ -129,9 +130,13 @@ def run_evaluation(arguments: argparse.Namespace, stop: threading.Event, stream:
     notes: list[str] = []
     try:
         if arguments.video is None:
-            evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
+            with Surroundings():
+                evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
         else:
-            with Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video:
+            with (
+                Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video,
+                Surroundings(),
+            ):
                 evaluation = _play(policy, spec, modules, arguments, seed, progress, video)
             filmed = {"video": str(arguments.video), "video_seconds": video.seconds}
             if video.rate.guess:

@@ -51,6 +51,7 @@ from daedalus.learner.run.initial import check_initial, initial_to_resume
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
+from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import (
     ModuleNotAllowedError,
     UserModuleError,
@@ -171,7 +172,8 @@ def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
     modules = UserModules(frozenset(parsed.allow_module), source)
     modules.check(spec.user_modules)
     budget = [] if parsed.env_steps is None else [f"training.env_steps={parsed.env_steps}"]
-    return with_record(with_changes(spec, [*parsed.set, *budget], parsed.directory), modules)
+    with Surroundings():  # which an algorithm of the user may change when it is imported
+        return with_record(with_changes(spec, [*parsed.set, *budget], parsed.directory), modules)
 
 
 def train_parser() -> argparse.ArgumentParser:
