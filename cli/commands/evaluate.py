@@ -20,7 +20,7 @@ from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.evaluation_progress import EvaluationProgress, EvaluationStoppedError
-from daedalus.cli.logs import configure_logging, print_error
+from daedalus.cli.logs import configure_logging, print_error, say
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
     exit_status,
@@ -67,7 +67,7 @@ def main(
         arguments.log_level,
         as_json=arguments.log_json,
         prefix="daedalus evaluate: ",
-        write=lambda line: print(line, file=sys.stderr),
+        write=lambda line: say(line, sys.stderr),
     )
     stop = stop or threading.Event()
     try:
@@ -93,7 +93,7 @@ def main(
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print_error("evaluate", "stopped" if stop.is_set() else error)
         return 1
-    print(json.dumps(result) if arguments.json else _text(result), file=output, flush=True)
+    say(json.dumps(result) if arguments.json else _text(result), output)
     return 0 if not arguments.record or _record(result, arguments.directory) else 1
 
 
@@ -114,7 +114,7 @@ def _reserved_stdout() -> TextIO:
 
     This includes libraries that are not Python's, and the processes of environments.
     """
-    result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return result
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from daedalus.actor.errors import ActorError
 from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_tls, command_parser
 from daedalus.cli.gateway_packages import INSTALL
-from daedalus.cli.logs import add_logging, configure_logging, print_error
+from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.cli.other_runs import OtherRuns
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
@@ -211,7 +211,7 @@ def _camera(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 def _announce(address: str) -> None:
     """Print the address of the page, for the person who started the run."""
-    print(f"watch the run at {address}", flush=True)
+    say(f"watch the run at {address}")
 
 
 async def _serve(

@@ -18,7 +18,7 @@ from daedalus.cli.arguments import (
 )
 from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
-from daedalus.cli.logs import add_logging, configure_logging, print_error
+from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
@@ -153,7 +153,7 @@ def resume(arguments: list[str]) -> int:
     with lock:
         finished = finished_run(parsed.directory, spec)
         if finished is not None and not finished.to_evaluate:
-            print(f"nothing to do: {finished.reason}")
+            say(f"nothing to do: {finished.reason}")
             return _MISSED if finished.missed else 0
         try:
             begun = checkpoints(parsed.directory) and not spec.environment.user_modules  # whose folder may be another
@@ -280,15 +280,15 @@ def _run(
         with output:
             end = run_locally(run, stopping, output, output.unlimited_pipes if live else inherited)
     except RunStoppedError:
-        print(f"stopped; continue with: {resume_command(run)}")
+        say(f"stopped; continue with: {resume_command(run)}")
         return 1
     except RunFailedError as error:
         if str(error):
-            print(f"{command}: {str(error).rstrip()}", file=sys.stderr)
+            say(f"{command}: {str(error).rstrip()}", sys.stderr)
         if not (resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
         if not isinstance(error, UnsavedError) and checkpoints(directory):
-            print(f"when that is corrected, continue with: {resume_command(run)}", file=sys.stderr)
+            say(f"when that is corrected, continue with: {resume_command(run)}", sys.stderr)
         return error.status
     show(report(run, end.summary), command)
     return end.status
