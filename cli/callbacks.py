@@ -10,6 +10,7 @@ from pathlib import Path
 
 from daedalus.cli.running.run_observer import RunObserver
 from daedalus.learner.reporting.user_metrics import MOST_METRICS
+from daedalus.policy.user_code import Surroundings
 from daedalus.protocol.keys import is_name
 
 _READ_BYTES = 1 << 16
@@ -64,7 +65,7 @@ class Callback:
 
     `daedalus.train` calls the methods in its own process and thread, between two looks at the processes of the run.
     Training does not wait for them. An exception in a method ends the run with a checkpoint, and `daedalus.train`
-    raises it.
+    raises it. A method that changes the working directory does so for itself: it is changed back afterwards.
     """
 
     def on_start(self, run: TrainingRun) -> None:
@@ -105,11 +106,13 @@ class CallbackObserver(RunObserver):
 
     def begin(self, address: str) -> None:
         """See RunObserver."""
-        self._callback.on_start(self._run)
+        with Surroundings():
+            self._callback.on_start(self._run)
 
     def end(self) -> None:
         """See RunObserver."""
-        self._callback.on_end(self._run)
+        with Surroundings():
+            self._callback.on_end(self._run)
 
     def poll(self, learner: subprocess.Popen[bytes]) -> bool:
         """See RunObserver. Pass new rows to the callback, and its metrics to the learner."""
@@ -118,7 +121,8 @@ class CallbackObserver(RunObserver):
                 row = json.loads(line)
             except ValueError:  # cut off when the pipe was full
                 continue
-            self._callback.on_metrics(self._run, row)
+            with Surroundings():
+                self._callback.on_metrics(self._run, row)
             if self._run.stop_reason is not None:
                 break
         metrics = self._run.take_metrics()

@@ -6,7 +6,7 @@ import threading
 
 from daedalus.cli.settings_arguments import LISTEN, ChosenRun
 from daedalus.learner.serving.rollout_intake import largest_request
-from daedalus.policy.user_modules import allow_settings
+from daedalus.policy.user_modules import allow_settings, shown_path
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials
@@ -54,5 +54,7 @@ def announce(run: ChosenRun, arguments: argparse.Namespace, credentials: Credent
     """Log how actors join."""
     if arguments.prepared is None:
         spec = run.spec
-        _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
+        _logger.info(
+            "run %s: learning %s with %s", shown_path(str(run.directory)), spec.environment.id, spec.training.algorithm
+        )
         _logger.info("actors join with: %s", how_to_join(addresses_of(arguments), credentials, spec))

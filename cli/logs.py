@@ -3,15 +3,15 @@
 import argparse
 import json
 import logging
-import re
 import sys
 import time
 from collections.abc import Callable, Mapping
+from typing import TextIO
 
 from daedalus.protocol import keys
+from daedalus.protocol.texts import printable
 from daedalus.protocol.timestamps import utc
 
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # all but tab and newline
 EVENTS = "daedalus.learner.serving.events"  # logger of the events of a run
 LEVELS = ("debug", "info", "warning", "error")
 
@@ -56,7 +56,7 @@ def configure_logging(
         formatter = _TerminalFormatter(process, context)
     else:
         formatter = _ServiceFormatter(process, context)
-    handler = _LineHandler(write or _print)
+    handler = LineHandler(write or say)
     handler.setFormatter(formatter)
     if not (process or as_json or level == "debug"):
         handler.addFilter(_needs_attention)
@@ -70,26 +70,22 @@ def _needs_attention(record: logging.LogRecord) -> bool:
     return record.name != EVENTS or record.levelno >= logging.WARNING or getattr(record, "event", "") == "target"
 
 
-def _print(line: str) -> None:
-    print(line, flush=True)
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Print a text that may contain what comes from outside; None: on standard output.
 
-
-def printable(text: str) -> str:
-    """Return `text` with control characters escaped: it may come from a peer, and a terminal would obey them."""
-    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
-
-
-def one_line(text: str) -> str:
-    """Return `text` in one line, with control characters escaped."""
-    return printable(" ".join(text.split()))
+    What the stream cannot encode is escaped: the stream may be one of another program that calls a function of ours.
+    """
+    stream = stream or sys.stdout
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    print(printable(text).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
 
 def print_error(command: str, text: object) -> None:
-    """Write why `daedalus COMMAND` fails to standard error. The text may contain what a peer sent."""
-    print(f"daedalus {command}: {printable(str(text))}", file=sys.stderr)
+    """Write why `daedalus COMMAND` fails to standard error."""
+    say(f"daedalus {command}: {text}", sys.stderr)
 
 
-class _LineHandler(logging.Handler):
+class LineHandler(logging.Handler):
     """Handler that writes each record as one line. It ignores a closed terminal."""
 
     def __init__(self, write: Callable[[str], None]) -> None:

@@ -4,6 +4,7 @@ import os
 import sys
 
 from daedalus.cli.command_table import COMMANDS
+from daedalus.cli.logs import say
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, interrupts_held
 
 USAGE = """\
@@ -62,7 +63,7 @@ def _run() -> int:
 
         near = difflib.get_close_matches(command, COMMANDS, 1, 0.5)
         hint = f"did you mean {near[0]}?" if near else "`daedalus --help` lists the commands"
-        print(f"daedalus: unknown command {command!r}: {hint}", file=sys.stderr)
+        say(f"daedalus: unknown command {command!r}: {hint}", sys.stderr)
         return 2
     if COMMANDS[command].function:
         exit_on_thread_exceptions()

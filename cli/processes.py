@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import io
 import logging
 import os
 import select
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import NoReturn, TextIO
 
 from daedalus.policy.user_code import frames_of, is_of_user
+from daedalus.protocol.texts import printable
 from daedalus.transport.slow_calls import in_progress
 
 _logger = logging.getLogger(__name__)
@@ -184,6 +186,8 @@ def exit_with_parent(stop: threading.Event, on_line: Callable[[bytes], None] = l
 def open_standard_streams() -> None:
     """Open each standard stream that was closed when the process started, as by `>&-`; what it receives is discarded.
 
+    What an output cannot encode, such as a path in a locale without UTF-8, is escaped from now on.
+
     Call it before any other file is opened. A descriptor that is free would go to the next file, and what libraries and
     child processes print would be written into that file.
     """
@@ -191,7 +195,10 @@ def open_standard_streams() -> None:
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free one, which is that of the stream
             os.set_inheritable(descriptor, True)
-            setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", errors="replace"))
+            setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", errors="backslashreplace"))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors != "backslashreplace":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
@@ -220,7 +227,7 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     except PermissionError as error:
         if error.filename is None:
             raise
-        print(f"daedalus: {error.filename}: {error.strerror}", file=sys.stderr)
+        print(printable(f"daedalus: {error.filename}: {error.strerror}"), file=sys.stderr)
         return 1
     except OSError as error:
         if error.errno not in UNWRITABLE or error.filename is not None:

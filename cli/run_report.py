@@ -6,6 +6,7 @@ import sys
 from contextlib import suppress
 from typing import Any
 
+from daedalus.cli.logs import say
 from daedalus.cli.processes import UNWRITABLE, discard
 from daedalus.cli.running.local_run import LocalRun
 from daedalus.protocol.texts import exact_number, short_number
@@ -40,14 +41,14 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
 def show(text: str, command: str) -> None:
     """Print the result of a run. A full disk is no fault of the run: standard error has one line of `command` then."""
     try:
-        print(text, flush=True)
+        say(text)
     except OSError as error:
         if error.errno not in UNWRITABLE:
             raise
         discard(sys.stdout)
         with suppress(OSError):
             message = f"cannot print the result, which is in the run directory: {error.strerror}"
-            print(f"{command}: {message}", file=sys.stderr)
+            say(f"{command}: {message}", sys.stderr)
 
 
 def _confirmed(run: LocalRun, summary: dict[str, Any]) -> list[str]:

@@ -15,6 +15,7 @@ from typing import Any, TextIO
 
 from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.logs import LineHandler, say
 from daedalus.cli.quick_check import EnvironmentProblemError
 from daedalus.cli.running.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError
 from daedalus.cli.running.new_run import prepare
@@ -179,8 +180,7 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
 
     def write(line: str, stream: TextIO) -> None:
         if not quiet:
-            stream.write(f"{line}\n")
-            stream.flush()
+            say(line, stream)
 
     def write_error(line: str) -> None:
         errors.append(line)
@@ -202,7 +202,7 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
 
 
 def _handler(quiet: bool) -> logging.Handler:
-    return logging.NullHandler() if quiet else logging.StreamHandler(sys.stdout)
+    return logging.NullHandler() if quiet else LineHandler(say)
 
 
 @contextmanager

@@ -1,8 +1,12 @@
-"""Errors that the user's code raised, in one line: what they are, and where they were raised."""
+"""What the user's code does to this process: errors, in one line with their place, and another working directory."""
 
+import os
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 from daedalus.policy.user_modules import shown_path
 
@@ -39,3 +43,31 @@ def place_of(error: BaseException | None) -> str:
     for frame in filter(is_of_user, frames_of(error)):
         place = f" ({shown_path(frame.tb_frame.f_code.co_filename)}, line {frame.tb_lineno})"
     return place
+
+
+class Surroundings:
+    """What a process has by itself and the user's code may change: the working directory, the umask, and the path of
+    modules. As a context manager, it restores them at the end: relative paths mean the same as before.
+    """
+
+    def __init__(self) -> None:
+        """Note them as they are now."""
+        self.directory = Path()  # what relative paths begin with
+        with suppress(OSError):  # it has been removed
+            self.directory = Path.cwd()
+        self._umask = os.umask(0o077)  # which cannot be read otherwise; meanwhile files of other threads are private
+        os.umask(self._umask)
+        self._modules = list(sys.path)
+
+    def restore(self) -> None:
+        """Restore them. What was added to the path of modules stays: a module of the user may import more later."""
+        with suppress(OSError):
+            os.chdir(self.directory)
+        os.umask(self._umask)
+        sys.path.extend(entry for entry in self._modules if entry not in sys.path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.restore()

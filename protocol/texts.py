@@ -1,7 +1,32 @@
-"""Texts for a person who reads them: those of peers, bounded, and numbers. Pure functions."""
+"""Texts for a person who reads them: those from outside, printable or bounded, and numbers. Pure functions.
+
+Outside are peers, and whoever has sent a run directory: names, reasons, paths and errors. A terminal obeys control
+characters; others reorder a line, hide in it or end it. `str.isprintable` knows them all, also those to come: controls,
+formats such as the marks of direction and the tags, separators other than the space, halves of characters that stand
+for the bytes of a file's name, and what Unicode has not assigned. Whatever reaches a terminal, a log or a file goes
+through one of these functions.
+"""
 
 MAX_NAME, MAX_TEXT = 64, 300  # bytes in UTF-8: of a name, and of a reason or an event
 MAX_ANSWER_TEXT = 1000  # bytes in UTF-8: of the reason in an answer to this process
+
+
+def printable(text: str) -> str:
+    """Return a text with every character that is not printable escaped, except newlines and tabs."""
+    if text.isprintable():
+        return text
+    return "".join(
+        character if character.isprintable() or character in "\n\t" else _escaped(character) for character in text
+    )
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
+
+def one_line(text: str) -> str:
+    """Return a text in one line, printable."""
+    return printable(" ".join(text.split()))
 
 
 def bounded_text(text: str, most: int = MAX_TEXT) -> str:

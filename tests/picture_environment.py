@@ -50,3 +50,30 @@ def with_doubled_rewards(environment: gymnasium.Env) -> gymnasium.Env:
 
 def with_nothing_to_play(environment: gymnasium.Env) -> str:
     return str(environment)
+
+
+class _Skipped(gymnasium.Wrapper):
+    def step(self, action: Any) -> Any:
+        for _ in range(3):
+            self.env.step(action)
+        return self.env.step(action)
+
+
+def with_skipped_frames(environment: gymnasium.Env) -> gymnasium.Env:
+    return _Skipped(environment)
+
+
+def with_skipped_frames_that_it_states(environment: gymnasium.Env) -> gymnasium.Env:
+    return with_a_rate_of_its_own(_Skipped(environment), 10)
+
+
+def with_a_rate_of_its_own(environment: gymnasium.Env, rate: float = 7) -> gymnasium.Env:
+    environment = gymnasium.Wrapper(environment)
+    environment.metadata = {**environment.metadata, "render_fps": rate}
+    return environment
+
+
+def without_rate(environment: gymnasium.Env) -> gymnasium.Env:
+    environment = gymnasium.Wrapper(environment)
+    environment.metadata = {}
+    return environment

@@ -3,7 +3,9 @@
 import ast
 import inspect
 import json
+import os
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -257,6 +259,96 @@ def test_evaluate_records_a_video(tmp_path: Path) -> None:
     assert result.video == tmp_path / "play.gif"
     assert (tmp_path / "play.gif").read_bytes().startswith(b"GIF89a")
     assert len(result.returns) == 1
+
+
+ELSEWHERE = """
+import os
+import sys
+import gymnasium
+import numpy as np
+from torch import nn
+
+def leave():
+    os.makedirs(ELSEWHERE, exist_ok=True)
+    os.chdir(ELSEWHERE)
+    os.umask(0)
+    sys.path[:] = [entry for entry in sys.path if entry != HELPERS]
+
+class Leaving(gymnasium.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, render_mode=None):
+        self.render_mode, self.steps = render_mode, 0
+        leave()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(2, np.float32), 1.0, self.steps == 5, False, {}
+
+    def render(self):
+        return np.zeros((8, 8, 3), np.uint8)
+
+class Net(nn.Module):
+    def __init__(self, space):
+        super().__init__()
+        self.layer = nn.Linear(2, 8)
+        leave()
+
+    def forward(self, observation):
+        leave()
+        return self.layer(observation)
+
+gymnasium.register("Leaving-v0", Leaving)
+"""
+
+
+def test_the_code_of_the_user_may_change_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of its process: relative paths mean what they meant before, and the program stays where it was."""
+    here, elsewhere, helpers = tmp_path / "here", tmp_path / "elsewhere", str(tmp_path / "helpers")
+    here.mkdir()
+    (here / "leaving.py").write_text(f"ELSEWHERE = {str(elsewhere)!r}\nHELPERS = {helpers!r}\n{ELSEWHERE}")
+    monkeypatch.chdir(here)
+    monkeypatch.syspath_prepend(helpers)
+
+    class Restless(daedalus.Callback):
+        rows = 0
+
+        def on_start(self, run: daedalus.TrainingRun) -> None:
+            os.chdir("/")
+
+        def on_metrics(self, run: daedalus.TrainingRun, row: Mapping[str, float]) -> None:
+            assert Path.cwd() == here
+            self.rows += 1
+            os.chdir("/")
+
+        on_end = on_start
+
+    callback = Restless()
+    settings = {**BUDGET["settings"], "policy.encoder": "leaving:Net", "service.log_seconds": 0.05}
+    result = daedalus.train(
+        env="leaving:Leaving-v0", run_dir="run", callback=callback, settings=settings, env_steps=600, actors=1
+    )
+    assert callback.rows
+    assert result.directory == Path("run")
+    expected = {"config.toml", "versions.json", "metrics.csv", "summary.json", "evaluation.json", "events.jsonl"}
+    assert expected < {file.name for file in (here / "run").iterdir()}
+    assert list((here / "run" / "checkpoints").iterdir())
+    played = daedalus.evaluate("run", video="run/play.gif", allow_modules=["leaving"])
+    assert (here / "run" / "play.gif").is_file()
+    assert evaluate_command(["run", "--allow-module", "leaving", "--record", "--episodes", "2"]) == 0
+    assert len(json.loads((here / "run" / "evaluation.json").read_text())["returns"]) == 2
+    assert stat.S_IMODE((here / "run" / "evaluation.json").stat().st_mode) & 0o022 == 0
+    assert Path.cwd() == here
+    assert helpers in sys.path
+    assert played.lengths.tolist() == [5]
+    assert not list(elsewhere.iterdir())
 
 
 def test_invalid_arguments_of_evaluate_are_refused(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ used.
 import contextlib
 import functools
 import logging
+import os
 import ssl
 import time
 from dataclasses import dataclass
@@ -104,7 +105,8 @@ def load(directory: Path, *roles: str) -> Credentials:
             f"{directory} holds the certificate of {_described(role, name)}, but {' or '.join(roles)} is required: "
             f"issue one (daedalus certs issue {roles[0]})"
         )
-    return Credentials(directory, role, name)
+    # It is read again later, when the code of a user may have changed the working directory.
+    return Credentials(Path(os.path.abspath(directory)), role, name)
 
 
 def authorised_names(directory: Path) -> dict[str, list[str]]:

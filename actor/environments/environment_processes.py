@@ -3,6 +3,7 @@
 import multiprocessing.connection
 import multiprocessing.process
 import multiprocessing.resource_tracker
+import multiprocessing.spawn
 import os
 import signal
 import sys
@@ -40,6 +41,22 @@ _ERROR_SECONDS = 10.0  # from the answer of a process that failed to its error
 _UNMADE = 70  # exit status of a process whose environment cannot be made
 
 _PRELOADED = ["daedalus.actor.environments.gymnasium_backend"]
+
+# Python would run the program's main module again in each process: a script without `if __name__ == "__main__":` would
+# do all its work once more, and that of standard input cannot be read twice. What a process needs of it is pickled.
+_starting = threading.local()  # .without_main: whether this thread starts such processes
+_python_preparation_data = multiprocessing.spawn.get_preparation_data
+
+
+def _preparation_data(name: str) -> dict[str, Any]:
+    data = _python_preparation_data(name)
+    if getattr(_starting, "without_main", False):
+        for key in ("init_main_from_name", "init_main_from_path"):
+            data.pop(key, None)
+    return data
+
+
+multiprocessing.spawn.get_preparation_data = _preparation_data
 
 _Stepped = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
@@ -179,6 +196,7 @@ class EnvironmentProcesses(AsyncVectorEnv):
                 raise error from None
             except BaseException:
                 _kill(getattr(self, "processes", ()))
+                self.closed = True  # the garbage collector may have closed the pipes before it closes this
                 raise
         # The interpreter waits for processes that are no daemons: end those that nobody has closed.
         weakref.finalize(self, _kill, self.processes)
@@ -191,6 +209,13 @@ class EnvironmentProcesses(AsyncVectorEnv):
             "worker": partial(_serve, self._name, len(makers)),
             "daemon": False,  # an environment may start processes of its own
         }
+        _starting.without_main = True
+        try:
+            self._start_with(makers, options)
+        finally:
+            _starting.without_main = False
+
+    def _start_with(self, makers: Sequence[_Maker], options: dict[str, Any]) -> None:
         try:
             super().__init__(makers, **options)
         except (TypeError, ValueError) as error:

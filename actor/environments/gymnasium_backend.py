@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import CloudpickleWrapper
 
 from daedalus.actor.environments import atari
 from daedalus.actor.environments.environment_errors import (
@@ -21,8 +22,9 @@ from daedalus.actor.environments.environment_processes import EnvironmentProcess
 from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
 from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
 from daedalus.actor.environments.masks import has_choices
-from daedalus.actor.environments.rendering import render_without_display
+from daedalus.actor.environments.rendering import CountedSteps, render_without_display
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
+from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -46,10 +48,11 @@ class EnvironmentFactory:
     render_mode: str | None = None
     camera: Camera | None = None
     one_episode: bool = False
+    registered: EnvSpec | None = None  # if the process that makes the environment may not have its registration
 
     def __call__(self) -> gymnasium.Env:
         """Return a new environment. Raises whatever the environment raises."""
-        spec, registered = self.spec, registration(self.spec.id, self.modules)
+        spec, registered = self.spec, self.registered or registration(self.spec.id, self.modules)
         kwargs = _kwargs(spec)
         of_atari = atari.take_arguments(kwargs) if registered.namespace == "ALE" else {}
         if self.render_mode is not None:
@@ -70,7 +73,10 @@ class EnvironmentFactory:
                 f"environment {spec.id} cannot render {self.render_mode} images: {reason}"
             ) from None
         environment = atari.wrapped(environment, of_atari)
+        below = None
         if spec.wrap is not None:
+            if self.camera is not None:
+                environment = below = CountedSteps(environment)
             environment = _wrapped(environment, spec.wrap, self.modules)
         if environment.has_wrapper_attr("action_masks"):
             environment = MaskInInfo(environment)
@@ -81,6 +87,7 @@ class EnvironmentFactory:
                 repeat=spec.action_repeat,
                 no_reward_limit=spec.no_reward_limit,
                 camera=self.camera,
+                below=below,
             )
         if late_rendered:
             from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages
@@ -219,8 +226,30 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
         if registered.entry_point is None:  # its environments share a random generator, so more than one would not do
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
-        return EnvironmentProcesses(spec.id, [factory] * count, left_out=spec.leave_out)
+        if ":" not in spec.id:  # no module registers it there: the program itself may have done it here
+            factory = replace(factory, registered=registered)
+        return _in_processes(factory, count)
     return EnvironmentsInTurn(spec.id, [factory] * count, left_out=spec.leave_out)
+
+
+def _in_processes(factory: EnvironmentFactory, count: int) -> EnvironmentProcesses:
+    """Return environments in processes, which do not import the main module of this program."""
+    spec = factory.spec
+    try:
+        CloudpickleWrapper(factory).__getstate__()
+    except Exception as error:  # of whatever the program has registered
+        reason = first_line(error)
+    else:
+        try:
+            return EnvironmentProcesses(spec.id, [factory] * count, left_out=spec.leave_out)
+        except AttributeError as error:
+            if "__main__" not in str(error):
+                raise
+            reason = first_line(error)  # such as a space of a class of its own, in the answer of a process
+    raise EnvironmentSetupError(
+        f"environment {spec.id} is of this program itself, and does not work in processes ({reason}): move it to a "
+        f"module and name it MODULE:{spec.id}, or use environment.processes=false"
+    )
 
 
 def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:

@@ -1,12 +1,9 @@
 """Creates environments from their specification."""
 
-from collections.abc import Callable
-
-import numpy as np
-
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import BackendEnvironments, VectorEnvironment
 from daedalus.actor.environments.transforms import TransformedEnvironment
+from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -17,7 +14,7 @@ def make_environments(
     *,
     modules: UserModules = NO_MODULES,
     render_mode: str | None = None,
-    camera: Callable[[np.ndarray], None] | None = None,
+    camera: Camera | None = None,
     one_episode: bool = False,
 ) -> VectorEnvironment:
     """Return `count` environments of one kind, created by the backend that the specification names.
@@ -27,8 +24,8 @@ def make_environments(
       count: E, the number of environments.
       modules: the modules that may be imported for it.
       render_mode: gymnasium's; "human" opens a window, and a camera needs "rgb_array".
-      camera: called with the rendered image [H, W, 3] uint8 after each reset and after every step, repeated ones
-        included. Requires count 1.
+      camera: called with the rendered image [H, W, 3] uint8, and the rate at which images are meant to be shown, after
+        each reset and after every step, repeated ones included. Requires count 1.
       one_episode: for evaluations: environment e of `reset(seed)` plays an episode that its seed, `seed` + e,
         determines, however many environments there are. It need not play another. Environments that share one random
         generator, because gymnasium registers them with a vector entry point only, are reduced to one environment.
@@ -56,7 +53,7 @@ def make_bare(
     count: int,
     modules: UserModules,
     render_mode: str | None = None,
-    camera: Callable[[np.ndarray], None] | None = None,
+    camera: Camera | None = None,
     one_episode: bool = False,
 ) -> tuple[BackendEnvironments, EnvironmentSpec]:
     """Return the backend's environments, and the specification without the transforms that the backend does itself.

@@ -13,9 +13,10 @@ from daedalus.actor.environments.components import dtype_misfit
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.leaves import leaves, without
 from daedalus.actor.environments.masks import MASK_KEY
+from daedalus.actor.environments.rendering import CountedSteps, FrameRate, frame_rate
 from daedalus.policy.user_code import first_line, place_of
 
-Camera = Callable[[np.ndarray], None]
+Camera = Callable[[np.ndarray, FrameRate], None]
 
 _ARRAYS = (gym.Box, gym.Discrete, gym.MultiDiscrete, gym.MultiBinary)
 
@@ -26,10 +27,10 @@ class Shutter:
     def __init__(self, camera: Camera) -> None:
         self._camera, self.is_open = camera, False
 
-    def __call__(self, picture: np.ndarray) -> None:
+    def __call__(self, picture: np.ndarray, rate: FrameRate) -> None:
         """Pass a picture on."""
         if self.is_open:
-            self._camera(picture)
+            self._camera(picture, rate)
 
 
 class MaskInInfo(gymnasium.Wrapper):
@@ -101,13 +102,18 @@ class RepeatedSteps(gymnasium.Wrapper):
         repeat: int,
         no_reward_limit: int | None,
         camera: Camera | None = None,
+        below: CountedSteps | None = None,
     ) -> None:
-        """Construct from the environment and its id, which is for errors of the camera."""
+        """Construct from the environment and its id, which is for errors of the camera.
+
+        `below` is the environment without the user's wrapper, if it has one.
+        """
         super().__init__(environment)
         self._name = name
         self._repeat = repeat
         self._no_reward_limit = no_reward_limit
         self._camera = camera
+        self._below, self._skipped = below, 1  # how many steps of `below` the newest step has made
         self._unrewarded = 0  # steps in a row
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -135,7 +141,9 @@ class RepeatedSteps(gymnasium.Wrapper):
     def _step_once(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         # A copy where the action is repeated: the environment may change its values in place.
         given = copy.deepcopy(action) if self._repeat > 1 else action
+        before = 0 if self._below is None else self._below.steps
         observation, reward, terminated, truncated, info = self.env.step(given)
+        self._skipped = 1 if self._below is None else self._below.steps - before
         self._film()
         return observation, float(reward), terminated, truncated, info
 
@@ -150,7 +158,7 @@ class RepeatedSteps(gymnasium.Wrapper):
             raise self._unrecorded(f": render raises {first_line(error)}{place_of(error)}") from error
         if not isinstance(picture, np.ndarray):
             raise self._unrecorded(f" renders {type(picture).__name__} instead of an image")
-        self._camera(picture)
+        self._camera(picture, frame_rate(self.env, self._below, self._skipped))
 
     def _unrecorded(self, reason: str) -> EnvironmentSetupError:
         return EnvironmentSetupError(f"environment {self._name}{reason}: a video of it cannot be recorded")

@@ -9,6 +9,7 @@ import numpy as np
 
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.rendering import FrameRate
 from daedalus.actor.evaluation.running_episodes import RunningEpisodes, refuse_unfit_rewards
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
@@ -35,6 +36,7 @@ class Moment:
     """One step of an episode."""
 
     picture: np.ndarray  # [height, width, 3] uint8, after the step
+    seconds: float  # that the step takes at the environment's own speed
     step: int  # from 1 in each episode
     reward: float
     total: float  # of the rewards of this episode
@@ -52,15 +54,16 @@ class EpisodeCamera:
         """
         self._estimate = estimate
         environment = as_on_gymnasium(spec.environment).model_copy(update={"processes": False})
-        self._picture = np.zeros((1, 1, 3), np.uint8)
+        self._picture, self._seconds = np.zeros((1, 1, 3), np.uint8), 0.0
         self._environments = make_environments(
             environment, 1, modules=modules, render_mode="rgb_array", camera=self._film, one_episode=True
         )
         self._longest = spec.evaluation.max_episode_env_steps
         self._random = np.random.default_rng()
 
-    def _film(self, picture: np.ndarray) -> None:
+    def _film(self, picture: np.ndarray, rate: FrameRate) -> None:
         self._picture = picture
+        self._seconds += 0.0 if rate.guess else 1.0 / rate.per_second  # of each repeated step
 
     @property
     def spaces(self) -> Spaces:
@@ -81,13 +84,20 @@ class EpisodeCamera:
             value = self._estimate(running.observations, running.state)
             choice = running.act(self._noise(runtime.noise_size, running.observations))
             taken = {name: values[:1] for name, values in choice.actions.items()}
+            self._seconds = 0.0
             observed, rewards, terminated, truncated = environments.step(taken)
             refuse_unfit_rewards(rewards, np.zeros(1, np.int64))
             running.observe(observed)
             total += float(rewards[0])
             facts = action_facts(spaces, choice)
             yield Moment(
-                picture=self._picture, step=step, reward=float(rewards[0]), total=total, value=value, actions=facts
+                picture=self._picture,
+                seconds=self._seconds,
+                step=step,
+                reward=float(rewards[0]),
+                total=total,
+                value=value,
+                actions=facts,
             )
             if terminated[0] or truncated[0]:
                 return

@@ -14,6 +14,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from daedalus.actor.environments.rendering import FrameRate
+
 _PACKAGES = {".mp4": "av", ".gif": "PIL"}
 FORMATS = tuple(_PACKAGES)
 
@@ -49,10 +51,13 @@ class Video:
             importlib.import_module(_PACKAGES[path.suffix.lower()])
         except ImportError as error:
             raise VideoError(f'{path.suffix} files need {error.name}: pip install "daedalus-rl[video]"') from None
-        self.frames_per_second = 30.0  # of the frames given to `add`; set it before the first
+        self.rate = FrameRate()  # of the frames
         self.frames = 0  # recorded so far
+        self.seconds = 0.0  # that the video plays; known at the end of the block
+        self._first: np.ndarray | None = None  # until the second one is there
         self._path = path
-        self._partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        # An absolute path: an environment may change the working directory before the first frame.
+        self._partial = Path(os.path.abspath(path.with_name(f".{path.name}.{os.getpid()}.partial")))
         self._width, self._max_seconds = width, max_seconds
         self._shape: tuple[int, ...] = ()
         self._encoder: _Encoder | None = None
@@ -69,30 +74,44 @@ class Video:
     @property
     def is_full(self) -> bool:
         """Whether the video has its greatest length."""
-        return self._max_seconds is not None and self.frames >= self._max_seconds * self.frames_per_second
+        # Less a rounding error: 0.3 x 10 is more than 3.
+        return self._max_seconds is not None and self.frames >= self._max_seconds * self.rate.per_second * (1 - 1e-9)
 
-    def add(self, frame: np.ndarray) -> None:
-        """Record one frame [height, width, 3] uint8 RGB."""
+    def add(self, frame: np.ndarray, rate: FrameRate) -> None:
+        """Record one frame [height, width, 3] uint8 RGB.
+
+        The rate of the second one is that of all: a wrapper that skips frames has made no step at the first one.
+        """
         if self.is_full:
             return
+        if self._encoder is None:
+            self.rate = rate
         try:
-            if self._encoder is None:
-                self._encoder = self._begin(frame)
+            if self._first is None:
+                self._check(frame)
+                self._first = frame.copy()  # a renderer may draw into it again
+            elif self._encoder is None:
+                self._encoder = self._begin(self._first)
             if frame.shape != self._shape:
                 raise VideoError(
                     f"the frames change from {self._shape} to {frame.shape}: all frames of a video must have one size"
                 )
-            self._encoder.add(frame)
+            if self._encoder is not None:
+                self._encoder.add(frame)
         except OSError as error:
             raise self._write_error(error) from None
         self.frames += 1
 
-    def _begin(self, frame: np.ndarray) -> "_Encoder":
+    def _check(self, frame: np.ndarray) -> None:
         if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
             raise VideoError(f"the frames must be uint8 [height, width, 3], not {frame.dtype} of {frame.shape}")
         self._shape = frame.shape
+
+    def _begin(self, first: np.ndarray) -> "_Encoder":
         kind = Mp4Encoder if self._path.suffix.lower() == ".mp4" else GifEncoder
-        return kind(self._partial, self.frames_per_second, frame.shape[1], frame.shape[0], self._width)
+        encoder = kind(self._partial, self.rate.per_second, first.shape[1], first.shape[0], self._width)
+        encoder.add(first)
+        return encoder
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -104,7 +123,7 @@ class Video:
                 return
             if not self._close():
                 raise VideoError(f"cannot write {self._path}: no frame was recorded")
-            os.replace(self._partial, self._path)
+            os.replace(self._partial, self._partial.with_name(self._path.name))
         except OSError as failure:
             raise self._write_error(failure) from None
         finally:
@@ -112,9 +131,11 @@ class Video:
 
     def _close(self) -> bool:
         """End the file; return False if there is no frame in it."""
-        if self._encoder is None:
+        if self._first is None:
             return False
-        self._encoder.close()
+        if self._encoder is None:
+            self._encoder = self._begin(self._first)
+        self.seconds = self._encoder.close()
         return True
 
     def _write_error(self, error: OSError) -> VideoError:
@@ -126,7 +147,9 @@ class _Encoder(Protocol):
 
     def add(self, frame: np.ndarray) -> None: ...
 
-    def close(self) -> None: ...
+    def close(self) -> float:
+        """End the file, and return how many seconds it plays."""
+        ...
 
 
 class Mp4Encoder:
@@ -139,6 +162,7 @@ class Mp4Encoder:
 
         width = width or frame_width
         self._size = [max(length // 2 * 2, 2) for length in (width, round(frame_height * width / frame_width))]
+        self._frames, self._frames_per_second = 0, frames_per_second
         self._av: Any = av
         # An absolute path: PyAV would read a relative one with a colon as a protocol.
         self._container: Any = av.open(str(path.absolute()), "w", format="mp4", options={"movflags": "+faststart"})
@@ -152,11 +176,13 @@ class Mp4Encoder:
         """Encode one frame [height, width, 3] uint8 RGB."""
         picture = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), "rgb24")
         self._container.mux(self._stream.encode(picture.reformat(*self._size, "yuv420p")))
+        self._frames += 1
 
-    def close(self) -> None:
-        """Write the frames that the encoder still holds, and the index."""
+    def close(self) -> float:
+        """Write the frames that the encoder still holds, and the index. See _Encoder."""
         try:
             self._container.mux(self._stream.encode(None))
+            return self._frames / self._frames_per_second
         finally:
             self._container.close()
 
@@ -173,36 +199,50 @@ class GifEncoder:
         width = width or min(frame_width, _GIF_WIDTH)
         self._size = width, max(round(frame_height * width / frame_width), 1)
         self._every = math.ceil(frames_per_second / _GIF_MAX_FRAMES_PER_SECOND)
-        self._seconds = self._every / frames_per_second  # duration of each image
+        self._frames_per_second = frames_per_second
         self._added = 0
         self._previous: Any = None
+        self._waiting: tuple[Any, tuple[int, int]] | None = None  # the newest image and its place: its end is unknown
+        self._hundredths = 0  # of a second, of the images before it
         self._file = path.open("wb")
         screen = b"".join(length.to_bytes(2, "little") for length in self._size) + bytes(3)  # no global palette
         self._file.write(b"GIF89a" + screen + b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00")
 
     def add(self, frame: np.ndarray) -> None:
         """Encode one frame [height, width, 3] uint8 RGB."""
-        from PIL import GifImagePlugin, Image, ImageChops
+        from PIL import Image, ImageChops
 
-        number, rest = divmod(self._added, self._every)
         self._added += 1
-        if rest:
+        if (self._added - 1) % self._every:
             return
+        self._write(self._added - 1)
         picture = Image.fromarray(frame).resize(self._size, Image.Resampling.BILINEAR)
         changed = (0, 0, *self._size)
         if self._previous is not None:
             changed = ImageChops.difference(self._previous, picture).getbbox() or (0, 0, 1, 1)
         self._previous = picture
         part = picture.crop(changed).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
-        # Durations are in hundredths of a second; rounding their sums keeps the total exact.
-        shown = round((number + 1) * self._seconds * 100) - round(number * self._seconds * 100)
-        self._file.writelines(
-            GifImagePlugin.getdata(part, changed[:2], duration=shown * 10, disposal=1, include_color_table=True)
-        )
+        self._waiting = part, changed[:2]
 
-    def close(self) -> None:
-        """Write the end of the file."""
+    def _write(self, end: int) -> None:
+        """Write the waiting image, which is shown until frame `end`."""
+        from PIL import GifImagePlugin
+
+        if self._waiting is None:
+            return
+        part, place = self._waiting
+        # Durations are in hundredths of a second; rounding their sums keeps the total exact. Players show an image of
+        # one hundredth for ten.
+        shown = max(round(end * 100 / self._frames_per_second) - self._hundredths, 2)
+        self._hundredths += shown
+        options = {"duration": shown * 10, "disposal": 1, "include_color_table": True}
+        self._file.writelines(GifImagePlugin.getdata(part, place, **options))
+
+    def close(self) -> float:
+        """Write the last image and the end of the file. See _Encoder."""
         try:
+            self._write(self._added)
             self._file.write(b";")
+            return self._hundredths / 100
         finally:
             self._file.close()

@@ -31,6 +31,7 @@ from daedalus.protocol.messages import Message, Program, Snapshot, Welcome
 _logger = logging.getLogger("daedalus.cli")
 
 FRAMES_PER_SECOND = 15.0
+_LONGEST_SECONDS = 1.0  # for one frame, for somebody who waits
 _NICENESS = 19
 _READ_BYTES = 1 << 20
 _BETWEEN_EPISODES_SECONDS = 0.7
@@ -81,7 +82,7 @@ class _Input:
 
 
 class _Output:
-    """Frames to the gateway, at most FRAMES_PER_SECOND."""
+    """Frames to the gateway, at most FRAMES_PER_SECOND; of slower environments at their own speed."""
 
     def __init__(self, stream: BinaryIO, stop: threading.Event) -> None:
         self._stream, self._stop, self._due = stream, stop, time.monotonic()
@@ -91,7 +92,8 @@ class _Output:
         facts = {"version": version, "step": moment.step, "reward": moment.reward, "total": moment.total}
         facts |= {"value": moment.value}
         self._stop.wait(max(self._due - time.monotonic(), 0.0))
-        self._due = max(self._due + 1.0 / FRAMES_PER_SECOND, time.monotonic())
+        seconds = min(max(moment.seconds, 1.0 / FRAMES_PER_SECOND), _LONGEST_SECONDS)
+        self._due = max(self._due + seconds, time.monotonic())
         self.write(frame({**facts, "actions": moment.actions}, jpeg(moment.picture)))
 
     def write(self, data: bytes) -> None:
@@ -106,6 +108,8 @@ def main(output: BinaryIO) -> int:
     add_allow_module(options, "the run")
     options.add_argument("--checkpoints", type=Path, help="run directory, for value estimates")
     arguments = options.parse_args()
+    if arguments.checkpoints is not None:  # the environment may change the working directory
+        arguments.checkpoints = Path(os.path.abspath(arguments.checkpoints))
     configure_logging("warning", as_json=False, process="camera")
     os.nice(_NICENESS)
     stop = stop_on_signals(exit_if_stuck=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.client_tokens import ClientTokens
-from daedalus.cli.logs import print_error
+from daedalus.cli.logs import print_error, say
 from daedalus.transport.credentials import CLIENTS, WARNING_DAYS, CredentialsError
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def certs(arguments: list[str]) -> int:
     except (CredentialsError, OSError, ValueError) as error:
         print_error("certs", error)
         return 1
-    print("\n".join(lines))
+    say("\n".join(lines))
     return 0
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from daedalus.actor.checking.report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
-from daedalus.cli.logs import print_error
+from daedalus.cli.logs import print_error, say
 from daedalus.cli.quick_check import with_preset
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
 from daedalus.learner.run.default_settings import default_settings
@@ -67,7 +67,7 @@ def check(arguments: list[str]) -> int:
         print_error("check", f"--seconds is {parsed.seconds:g}: choose a number above 0")
         return 2
     lines = _checked(spec, parsed)
-    print("\n".join(f"{name:<14}{text}" for name, text in lines))
+    say("\n".join(f"{name:<14}{text}" for name, text in lines))
     return 1 if any(name == "problem" for name, _ in lines) else 0
 
 

@@ -4,7 +4,7 @@ import argparse
 import time
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser, seconds
-from daedalus.cli.logs import print_error
+from daedalus.cli.logs import print_error, say
 from daedalus.cli.status_query import ask, no_answer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
@@ -113,7 +113,7 @@ def _request(transport: Transport, run: str, name: str) -> None:
         message = decode(answer, ACKNOWLEDGEMENT_LIMITS)
         if isinstance(message, Refusal):
             raise DrainError(bounded_text(message.reason, MAX_ANSWER_TEXT))
-    print(f"actor {name} leaves run {run!r} after its current rollout", flush=True)
+    say(f"actor {name} leaves run {run!r} after its current rollout")
 
 
 def _await_departures(transport: Transport, run: str, epochs: set[int], names: set[str], timeout: float | None) -> None:
@@ -126,7 +126,7 @@ def _await_departures(transport: Transport, run: str, epochs: set[int], names: s
             raise DrainError(f"the learner ended or was restarted; run this command again if needed for: {there}")
         alive = {actor.actor for status in statuses for actor in status.actors if actor.alive}
         for name in sorted(names - alive):
-            print(f"actor {name} has left", flush=True)
+            say(f"actor {name} has left")
         names &= alive
         if not names:
             return

@@ -10,9 +10,6 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, TextIO
 
-import gymnasium
-from gymnasium.envs.registration import load_env_creator
-
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
@@ -21,7 +18,7 @@ from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.evaluation_progress import EvaluationProgress, EvaluationStoppedError
-from daedalus.cli.logs import configure_logging, print_error
+from daedalus.cli.logs import configure_logging, print_error, say
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
     exit_status,
@@ -34,12 +31,11 @@ from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.hub import HubError, RepositoryNameError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.texts import short_number
 
-_FRAMES_PER_SECOND = 30.0  # of environments without render_fps
-_ATARI_FRAMES_PER_SECOND = 60.0
 _FAILURES = (
     EvaluationStoppedError,
     DamagedError,
@@ -69,7 +65,7 @@ def main(
         arguments.log_level,
         as_json=arguments.log_json,
         prefix="daedalus evaluate: ",
-        write=lambda line: print(line, file=sys.stderr),
+        write=lambda line: say(line, sys.stderr),
     )
     stop = stop or threading.Event()
     try:
@@ -95,7 +91,7 @@ def main(
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print_error("evaluate", "stopped" if stop.is_set() else error)
         return 1
-    print(json.dumps(result) if arguments.json else _text(result), file=output, flush=True)
+    say(json.dumps(result) if arguments.json else _text(result), output)
     return 0 if not arguments.record or _record(result, arguments.directory) else 1
 
 
@@ -116,7 +112,7 @@ def _reserved_stdout() -> TextIO:
 
     This includes libraries that are not Python's, and the processes of environments.
     """
-    result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return result
 
@@ -129,17 +125,25 @@ def run_evaluation(arguments: argparse.Namespace, stop: threading.Event, stream:
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
     progress = EvaluationProgress(stream, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
     filmed: dict[str, Any] = {}
+    notes: list[str] = []
     try:
         if arguments.video is None:
-            evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
+            with Surroundings():
+                evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
         else:
-            with Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video:
+            with (
+                Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video,
+                Surroundings(),
+            ):
                 evaluation = _play(policy, spec, modules, arguments, seed, progress, video)
-            filmed = {"video": str(arguments.video), "video_seconds": video.frames / video.frames_per_second}
+            filmed = {"video": str(arguments.video), "video_seconds": video.seconds}
+            if video.rate.guess:
+                notes.append(f"the speed of the video: {video.rate.guess}")
     finally:
         progress.end()
     actions = _actions(policy, arguments)
-    return {**_result(policy, spec, evaluation, actions), "seed": seed, "actions": actions, **filmed}
+    result = _result(policy, spec, evaluation, actions)
+    return {**result, "notes": [*result["notes"], *notes], "seed": seed, "actions": actions, **filmed}
 
 
 def _directory(arguments: argparse.Namespace) -> Path:
@@ -189,8 +193,6 @@ def _play(
         one_episode=True,
     )
     try:
-        if video is not None:
-            video.frames_per_second = _frames_per_second(spec)
         if environments.spaces != policy.spaces:
             raise EnvironmentSetupError(
                 f"{spec.id} (backend {spec.backend}) has {environments.spaces}; the policy was trained on "
@@ -209,16 +211,6 @@ def _play(
         )
     finally:
         environments.close()
-
-
-def _frames_per_second(spec: EnvironmentSpec) -> float:
-    """Return the frames per second at which an environment's own steps are meant to be shown."""
-    skipped = spec.kwargs.get("frameskip", 4)
-    if spec.id.startswith("ALE/") and isinstance(skipped, int):
-        return _ATARI_FRAMES_PER_SECOND / skipped  # its metadata say 30 for any frameskip
-    maker = gymnasium.spec(spec.id.rpartition(":")[2]).entry_point
-    metadata = getattr(load_env_creator(maker) if isinstance(maker, str) else maker, "metadata", {})
-    return float(metadata.get("render_fps", _FRAMES_PER_SECOND))
 
 
 def _actions(policy: SavedPolicy, arguments: argparse.Namespace) -> str:

@@ -18,7 +18,7 @@ from pathlib import Path
 from daedalus.actor.errors import ActorError
 from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_tls, command_parser
 from daedalus.cli.gateway_packages import INSTALL
-from daedalus.cli.logs import add_logging, configure_logging, print_error
+from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.cli.other_runs import OtherRuns
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
@@ -218,7 +218,7 @@ def _announce(token_file: Path | None) -> Callable[[str], None]:
     It does not print the token: the output may go to a log that others can read.
     """
     token = "" if token_file is None else f" with the token in {os.path.relpath(token_file)}"
-    return lambda address: print(f"watch the run at {address}{token}", flush=True)
+    return lambda address: say(f"watch the run at {address}{token}")
 
 
 async def _serve(

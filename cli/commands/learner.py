@@ -59,6 +59,7 @@ from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -92,6 +93,8 @@ def main() -> int:
     """Run `daedalus learner` and return its exit status."""
     started = time.monotonic()
     arguments = learner_parser().parse_args()
+    surroundings = Surroundings()  # a network or an algorithm of the user may change them
+    here = surroundings.directory
     keep_freed_memory()
     raise_descriptor_limit()
     stop = stop_on_signals()
@@ -102,12 +105,16 @@ def main() -> int:
         meeting = meeting_for(arguments)
         if meeting is not None and meeting.rank > 0:
             return follow_launched(meeting, arguments, stop)
-        run = choose_run(arguments)
-        ranks = ranks_for(arguments, run, meeting)
         credentials = learner_credentials(arguments)
+        run = choose_run(arguments)
+        run = replace(run, directory=here / run.directory)
+        ranks = ranks_for(arguments, run, meeting)
+        if arguments.init_from is not None:  # in the options of all ranks it is as it was typed
+            arguments.init_from = here / arguments.init_from
         if isinstance(ranks, StartedRanks) and not arguments.exit_with_parent:
             if arguments.run_dir is None:
                 run, _ = _with_spaces(run, arguments, stop)
+            surroundings.restore()
             return supervise_learner(run.directory, arguments, stop)
     except ModuleNotAllowedError as error:
         print_error("learner", allowing(error, ["daedalus", "learner", *sys.argv[1:]]))
@@ -254,7 +261,7 @@ def _with_spaces(
     chosen = with_record(chosen, run.modules)
     if spaces is not None and chosen.environment != run.spec.environment:
         spaces = expected_spaces(chosen, run.modules, stop)
-    return replace(run, spec=chosen, directory=directory), spaces
+    return replace(run, spec=chosen, directory=run.directory.with_name(directory.name)), spaces
 
 
 def _writers(directory: Path, rows_to: int | None) -> list[OpenWriter]:

@@ -8,7 +8,7 @@ from daedalus.cli.commands.compare import parse_groups
 from daedalus.cli.comparing.drawing import COLUMNS, INSTALL, draw_curves, draw_profiles
 from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
 from daedalus.cli.comparing.selection import select
-from daedalus.cli.logs import print_error
+from daedalus.cli.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\
@@ -80,5 +80,5 @@ def plot(arguments: list[str]) -> int:
     except RunDataError as error:
         print_error("plot", error)
         return 1
-    print(f"wrote {parsed.output}")
+    say(f"wrote {parsed.output}")
     return 0

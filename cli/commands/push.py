@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.logs import add_logging, configure_logging, print_error
+from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.hub import HubError, RepositoryNameError
 from daedalus.policy.saving.saved_policy import NoPolicyError
@@ -49,7 +49,7 @@ def push(arguments: list[str]) -> int:
         parsed.log_level,
         as_json=parsed.log_json,
         prefix="daedalus push: ",
-        write=lambda line: print(line, file=sys.stderr),
+        write=lambda line: say(line, sys.stderr),
     )
     try:
         address = upload(parsed.directory, parsed.repository, private=parsed.private)
@@ -62,5 +62,5 @@ def push(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print_error("push", "stopped")
         return 1
-    print(f"pushed to {address}")
+    say(f"pushed to {address}")
     return 0

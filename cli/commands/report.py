@@ -10,7 +10,7 @@ from daedalus.cli.commands.compare import parse_groups
 from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
 from daedalus.cli.comparing.selection import select
-from daedalus.cli.logs import print_error
+from daedalus.cli.logs import print_error, say
 from daedalus.cli.reports.page import comparison_page, run_page
 from daedalus.cli.reports.run_record import RunRecord, read_record
 from daedalus.learner.run.run_files import RunDataError
@@ -84,7 +84,7 @@ def report(arguments: list[str]) -> int:
     except OSError as error:
         print_error("report", f"{output}: {error.strerror}; choose another file with --output")
         return 1
-    print(f"wrote {output}")
+    say(f"wrote {output}")
     return 0
 
 

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.logs import one_line, print_error, printable
+from daedalus.cli.logs import print_error, say
 from daedalus.cli.status_query import ask, ask_events, no_answer
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.status_watch import watch_status
@@ -16,7 +16,7 @@ from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import ActorStatus, EventsPage, RefusedJoin, RunStatus
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.texts import one_line, printable, short_number
 from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.credentials import WARNING_DAYS, Credentials
 from daedalus.transport.interface import TransportError
@@ -108,7 +108,7 @@ def status(arguments: list[str]) -> int:
         _show_problems(statuses)
     else:
         for shown in filter(None, pages) if parsed.events else statuses:
-            print(_json(shown) if parsed.json else _text(shown))
+            say(_json(shown) if parsed.json else _text(shown))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
 
 
@@ -130,7 +130,7 @@ def _check_alive(directory: Path) -> int:
         print_error("status", f"{directory} is not a run directory: it has no {CONFIG}")
         return NO_ANSWER
     if not (directory / HEARTBEAT).exists():
-        print(f"no learner works in {directory}: it has ended, or not begun yet")
+        say(f"no learner works in {directory}: it has ended, or not begun yet")
         return HEALTHY
     silent = silence(directory)
     if silent is None:
@@ -142,7 +142,7 @@ def _check_alive(directory: Path) -> int:
 def _show_problems(statuses: list[RunStatus]) -> None:
     for status in statuses:
         for problem in status.problems:
-            print(one_line(f"{status.run}: {problem}"))
+            say(one_line(f"{status.run}: {problem}"))
 
 
 def _json(shown: RunStatus | EventsPage) -> str:

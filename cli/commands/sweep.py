@@ -11,7 +11,7 @@ from pathlib import Path
 import tomli_w
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.logs import configure_logging, print_error
+from daedalus.cli.logs import configure_logging, print_error, say
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
 from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
@@ -188,9 +188,9 @@ def _run(search: Search, folder: Path, axes: Sequence[Axis], parsed: argparse.Na
     end = Sweep(search, RunProcesses(parsed.jobs), display).run(stop_on_signals())
     if end.stopped:
         again = shlex.join(["daedalus", "sweep", *arguments])
-        print(f"stopped: {len(end.done)} of {search.total} runs have ended; continue with: {again}")
+        say(f"stopped: {len(end.done)} of {search.total} runs have ended; continue with: {again}")
         return 1
-    print(report(folder, search.planned, end, [axis.key for axis in axes], ranked=parsed.sampler))
+    say(report(folder, search.planned, end, [axis.key for axis in axes], ranked=parsed.sampler))
     return 1 if end.failed else 0
 
 

@@ -18,7 +18,7 @@ from daedalus.cli.arguments import (
 )
 from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
-from daedalus.cli.logs import add_logging, configure_logging, print_error
+from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
@@ -51,6 +51,7 @@ from daedalus.learner.run.initial import check_initial, initial_to_resume
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
+from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import (
     ModuleNotAllowedError,
     UserModuleError,
@@ -158,7 +159,7 @@ def resume(arguments: list[str]) -> int:
     with lock:
         finished = finished_run(parsed.directory, spec)
         if finished is not None and not finished.to_evaluate:
-            print(f"nothing to do: {finished.reason}")
+            say(f"nothing to do: {finished.reason}")
             return _MISSED if finished.missed else 0
         try:
             begun = checkpoints(parsed.directory) and not spec.environment.user_modules  # whose folder may be another
@@ -177,7 +178,8 @@ def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
     modules = UserModules(frozenset(parsed.allow_module), source)
     modules.check(spec.user_modules)
     budget = [] if parsed.env_steps is None else [f"training.env_steps={parsed.env_steps}"]
-    return with_record(with_changes(spec, [*parsed.set, *budget], parsed.directory), modules)
+    with Surroundings():  # which an algorithm of the user may change when it is imported
+        return with_record(with_changes(spec, [*parsed.set, *budget], parsed.directory), modules)
 
 
 def train_parser() -> argparse.ArgumentParser:
@@ -292,15 +294,15 @@ def _run(
         with output:
             end = run_locally(run, stopping, output, output.unlimited_pipes if live else inherited)
     except RunStoppedError:
-        print(f"stopped; continue with: {resume_command(run)}")
+        say(f"stopped; continue with: {resume_command(run)}")
         return 1
     except RunFailedError as error:
         if str(error):
-            print(f"{command}: {str(error).rstrip()}", file=sys.stderr)
+            say(f"{command}: {str(error).rstrip()}", sys.stderr)
         if not (resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
         if not isinstance(error, UnsavedError) and checkpoints(directory):
-            print(f"when that is corrected, continue with: {resume_command(run)}", file=sys.stderr)
+            say(f"when that is corrected, continue with: {resume_command(run)}", sys.stderr)
         return error.status
     show(report(run, end.summary), command)
     return end.status

@@ -13,6 +13,7 @@ from daedalus.cli.comparing.recorded_run import RETURN
 from daedalus.cli.comparing.statistics import performance_profile, profile_interval
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.replacing import replacing
+from daedalus.protocol.texts import one_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,7 +77,7 @@ def draw_profiles(groups: Sequence[Group], output: Path) -> None:
     thresholds = np.linspace(every.min() - margin, every.max() + margin, _THRESHOLDS)
     figure, axis = plt.subplots(figsize=(7, 4.5), layout="constrained")
     for group, scores in zip(groups, returns, strict=True):
-        (line,) = axis.plot(thresholds, performance_profile([scores], thresholds), label=group.name)
+        (line,) = axis.plot(thresholds, performance_profile([scores], thresholds), label=_label(group))
         low, high = profile_interval([scores], thresholds)
         axis.fill_between(thresholds, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
     axis.ticklabel_format(useOffset=False)
@@ -86,6 +87,11 @@ def draw_profiles(groups: Sequence[Group], output: Path) -> None:
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, loc="lower left")
     _save(figure, output)
+
+
+def _label(group: Group) -> str:
+    """Return the name of a group, printable, and no formula for matplotlib."""
+    return one_line(group.name).replace("$", r"\$")
 
 
 def _pyplot():
@@ -111,16 +117,16 @@ def _save(figure, output: Path) -> None:
 def _draw_group(axis: "Axes", group: Group, column: str, by: str) -> None:
     curve = group_curve(group.runs, column, by)
     if curve is None:
-        axis.plot([], label=group.name)
+        axis.plot([], label=_label(group))
         return
-    (line,) = axis.plot(curve.x, curve.mean, label=f"{group.name} ({len(group.runs)} runs)", linewidth=1.5)
+    (line,) = axis.plot(curve.x, curve.mean, label=f"{_label(group)} ({len(group.runs)} runs)", linewidth=1.5)
     axis.fill_between(curve.x, curve.low, curve.high, color=line.get_color(), alpha=0.15, linewidth=0)
 
 
 def _draw_run(axis: "Axes", group: Group, column: str, by: str) -> None:
     (run,) = group.runs
     x, y = points(run, column, by)
-    (line,) = axis.plot(x, y, label=group.name, linewidth=1.5)
+    (line,) = axis.plot(x, y, label=_label(group), linewidth=1.5)
     if column == RETURN:
         std_x, std = points(run, _STD, by)
         std = np.interp(x, std_x, std) if len(std) else np.zeros(len(x))

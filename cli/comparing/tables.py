@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from daedalus.cli.comparing.comparison import Comparison, Estimate, GroupResult
-from daedalus.cli.logs import printable
-from daedalus.protocol.texts import exact_number, short_number
+from daedalus.protocol.texts import exact_number, one_line, printable, short_number
 
 _FEW = 5  # runs
 
@@ -110,7 +109,7 @@ def as_csv(comparison: Comparison) -> str:
         numbers: list[float | None] = [result.reached, comparison.threshold]
         for name in _ESTIMATES:
             numbers += getattr(result, name) or (None, None, None)
-        writer.writerow([result.group, result.runs, *_blank(numbers)])
+        writer.writerow([one_line(result.group), result.runs, *_blank(numbers)])
     return stream.getvalue()
 
 

@@ -18,9 +18,9 @@ from daedalus.cli.reports.run_sections import setting_text, statistics_rows
 from daedalus.policy.saving.hub import LIBRARY
 from daedalus.policy.user_modules import allow_words, modules_of
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import one_line
 
 _TASK = "reinforcement-learning"
-_UNSHOWN = re.compile(r"[\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 _SHOWN_SECTIONS = ("environment", "policy", "collection", "training")
 
 
@@ -52,7 +52,7 @@ def _metadata(record: RunRecord, spec: RunSpec, repository: str) -> str:
     """Return the YAML, with the results in the form in which other libraries of reinforcement learning give them."""
     from huggingface_hub import EvalResult, ModelCardData
 
-    environment, algorithm = one_line(spec.environment.id), one_line(spec.training.algorithm)
+    environment, algorithm = _line(spec.environment.id), _line(spec.training.algorithm)
     metrics: list[tuple[str, str, Any]] = []
     if record.evaluation is not None:
         statistics = episode_statistics(record.evaluation)
@@ -118,7 +118,7 @@ def _results(evaluation: RecordedEvaluation | None) -> str:
 
 def _use(spec: RunSpec, repository: str) -> str:
     modules = modules_of(spec.environment.user_modules)
-    allowed = "".join(f" {shlex.quote(one_line(word))}" for word in allow_words(modules))
+    allowed = "".join(f" {shlex.quote(_line(word))}" for word in allow_words(modules))
     lines = [
         f'pip install "{LIBRARY}[hub]"',
         f"daedalus evaluate --from-hub {repository}{allowed}",
@@ -187,18 +187,18 @@ def _block(lines: Sequence[str], language: str) -> str:
     return "\n".join([f"```{language}", *lines, "```"])
 
 
-def one_line(text: str) -> str:
-    """Return text as one line of limited length, without characters that cannot be shown."""
-    return " ".join(_UNSHOWN.sub(" ", text).split())[:400]
+def _line(text: str) -> str:
+    """Return text as one printable line of limited length."""
+    return one_line(text)[:400]
 
 
 def plain(text: str) -> str:
     """Return text that Markdown shows as it is: no markup, no link, no cell of a table ends in it."""
-    escaped = re.sub(r"([\\`*{}\[\]#!|~$]|(?<!\w)_|_(?!\w))", r"\\\1", one_line(text))
+    escaped = re.sub(r"([\\`*{}\[\]#!|~$]|(?<!\w)_|_(?!\w))", r"\\\1", _line(text))
     escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return escaped.replace("://", ":&#47;/").replace("@", "&#64;")  # no automatic link, and nobody is notified
 
 
 def code(text: str) -> str:
     """Return text as inline code."""
-    return f"`{one_line(text).replace('`', chr(39))}`"
+    return f"`{_line(text).replace('`', chr(39))}`"

@@ -5,11 +5,10 @@ from outside cannot become markup.
 """
 
 import html
-import re
 from collections.abc import Collection, Iterable
 
-# Control characters are not allowed in HTML; the others reorder or hide the text around them.
-_UNSHOWN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+from daedalus.protocol.texts import printable
+
 _EMPTY = {"br", "img", "meta", "circle", "path", "line", "rect", "link"}
 
 
@@ -21,8 +20,8 @@ Child = str | int | float | None | Iterable["Child"]
 
 
 def escape(text: str) -> Html:
-    """Return text as markup; characters that cannot be shown become U+FFFD."""
-    return Html(html.escape(_UNSHOWN.sub("\N{REPLACEMENT CHARACTER}", text)))
+    """Return text as markup. What is not printable is not allowed in HTML, or reorders or hides the text around it."""
+    return Html(html.escape(printable(text)))
 
 
 def join(children: Child) -> Html:

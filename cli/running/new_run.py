@@ -7,6 +7,7 @@ from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.quick_check import checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.settings_arguments import check_processes
 from daedalus.learner.run.settings import SettingsError, unmeasured_target
+from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -26,6 +27,13 @@ def prepare(
 
     Raises SettingsError, or EnvironmentProblemError.
     """
+    with Surroundings():  # which an algorithm of the user may change when it is imported
+        return _prepared(resolve, env, processes, fork=fork)
+
+
+def _prepared(
+    resolve: Callable[[dict[str, Any] | None], RunSpec], env: str | None, processes: int, *, fork: bool
+) -> tuple[RunSpec, Spaces | None]:
     spec = resolve(None)
     check_processes(processes, spec)  # before the environment is made
     if env is None:

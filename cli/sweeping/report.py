@@ -14,6 +14,7 @@ from daedalus.cli.comparing.tables import as_csv, as_text
 from daedalus.cli.sweeping.plan import PlannedRun
 from daedalus.cli.sweeping.sweep import SweepEnd
 from daedalus.learner.run.run_files import RunDataError
+from daedalus.protocol.texts import one_line
 
 TABLE, RUNS, CURVES = "table.csv", "runs.csv", "curves.png"
 
@@ -70,7 +71,7 @@ def _write_runs(path: Path, planned: Sequence[PlannedRun], end: SweepEnd, keys: 
 
 def _result(run: PlannedRun, end: SweepEnd) -> list[object]:
     if run.name in end.failed:
-        return [f"failed: {end.failed[run.name]}", "", "", "", ""]
+        return [one_line(f"failed: {end.failed[run.name]}"), "", "", "", ""]
     try:
         recorded = read_run(run.directory, [SECONDS])
     except RunDataError as error:

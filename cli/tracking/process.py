@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import configure_logging, say
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.learner.reporting.trackers.tracker import TRACKERS, tracker_class
 from daedalus.learner.reporting.trackers.tracking import Tracking
@@ -40,10 +40,10 @@ def main() -> int:
 
 def _own_output() -> Callable[[str], None]:
     """Return a function that prints a line on standard output. What packages print goes to standard error."""
-    own = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    own = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
     sys.stdout.flush()
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return lambda line: print(line, file=own, flush=True)
+    return lambda line: say(line, own)
 
 
 def _end_in_time(finish: threading.Event) -> None:

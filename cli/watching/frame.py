@@ -10,12 +10,11 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from daedalus.cli.logs import one_line
 from daedalus.cli.watching.sparkline import ASCII, BLOCKS, sparkline
 from daedalus.cli.watching.watched_run import WatchedRun
 from daedalus.learner.reporting.progress import duration
 from daedalus.protocol.status import ActorStatus
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.texts import one_line, short_number
 
 _WIDE = 60  # columns
 _SPARKLINE_WIDTH = 60  # at most

@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, TextIO
 
-from daedalus.cli.logs import printable
+from daedalus.cli.logs import say
 from daedalus.cli.watching.watched_run import WatchedRun
 from daedalus.learner.reporting.progress import is_terminal
+from daedalus.protocol.texts import printable
 
 
 class Screen:
@@ -77,7 +78,8 @@ class Screen:
         with self._lock:
             if self._live is None or not stream.isatty():
                 # In place of the line of progress that a learner rewrites on the same terminal.
-                print(f"\r\x1b[K{line}" if stream.isatty() else line, file=stream, flush=True)
+                print("\r\x1b[K" if stream.isatty() else "", end="", file=stream)
+                say(line, stream)
                 return
             from rich.text import Text
 

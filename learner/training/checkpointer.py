@@ -12,6 +12,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpoint import save_checkpoint
 from daedalus.learner.training.learner import Learner
+from daedalus.policy.user_modules import shown_path
 from daedalus.protocol.spaces import Spaces
 
 _logger = logging.getLogger(__name__)
@@ -89,7 +90,9 @@ class Checkpointer:
             return None
         if self._health.save_fault:
             _logger.info("checkpoints are saved again")
-        self._events.add("checkpoint", f"checkpoint saved at {counters['env_steps']:,} env_steps: {directory}")
+        self._events.add(
+            "checkpoint", f"checkpoint saved at {counters['env_steps']:,} env_steps: {shown_path(str(directory))}"
+        )
         self._health.saved, self._health.save_fault = time.monotonic(), ""
         self._newest = self._learner.policy_version, directory
         return directory

@@ -1,10 +1,12 @@
 """The backend `gymnasium`: repeats, no_reward_limit, wrappers, cameras and processes."""
 
+import math
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+from ctypes.util import find_library
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,9 +25,11 @@ from daedalus.actor.environments import closing, environment_processes, gymnasiu
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium, make_gymnasium
+from daedalus.actor.environments.rendering import FrameRate, frame_rate
 from daedalus.actor.environments.wrappers import RepeatedSteps
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.texts import bounded_text
 
 created = partial(make.make_environments, modules=TEST_MODULES)
 
@@ -197,16 +201,89 @@ def test_the_module_of_an_environment_is_not_imported_unless_it_is_allowed(
 def test_camera_receives_every_step_of_the_environment() -> None:
     film: list[np.ndarray] = []
     spec = _picture(action_repeat=3, kwargs={"end": 4}, processes=True, crop=(1, 1, 1, 1))
-    environments = make_environments(spec, 1, render_mode="rgb_array", camera=film.append)
+    environments = make_environments(spec, 1, render_mode="rgb_array", camera=lambda picture, _: film.append(picture))
     environments.reset(1)
     _rows(environments, [0, 0, 0, 0])
     assert [int(picture[0, 0, 0]) for picture in film] == [0, 1, 2, 3, 4, 0, 1, 2, 3]
     assert film[0].shape == (2, 2, 3)
 
 
+def _rate(spec: EnvironmentSpec) -> FrameRate:
+    """The rate that a camera receives with the second picture."""
+    rates: list[FrameRate] = []
+    camera = lambda _, rate: rates.append(rate)  # noqa: E731
+    environments, _ = make.make_bare(spec, 1, TEST_MODULES, "rgb_array", camera)
+    shape = environments.action_space.shape
+    assert shape is not None
+    try:
+        environments.reset(1)
+        environments.step(np.zeros((1, *shape), environments.action_space.dtype))
+    finally:
+        environments.close()
+    return rates[1]
+
+
+@pytest.mark.parametrize(
+    ("environment", "kwargs", "rate"),
+    [
+        ("CartPole-v1", {}, 50.0),
+        ("ALE/Pong-v5", {}, 15.0),
+        ("ALE/Pong-v5", {"frameskip": 1}, 60.0),
+        ("Pong-v4", {}, 20.0),  # repeats an action two to four times
+        ("PongNoFrameskip-v4", {}, 60.0),
+        ("Hopper-v5", {}, 125.0),  # the class says nothing, the instance computes it
+        ("Hopper-v5", {"frame_skip": 2}, 250.0),
+        ("HalfCheetah-v5", {}, 20.0),
+    ],
+)
+@pytest.mark.parametrize("repeat", [1, 2])
+def test_camera_receives_the_rate_of_the_environment_itself(
+    environment: str, kwargs: dict[str, Any], rate: float, repeat: int
+) -> None:
+    if environment.startswith("H") and find_library("EGL") is None:
+        pytest.skip("libEGL is not installed")
+    spec = EnvironmentSpec(id=environment, kwargs=kwargs, action_repeat=repeat)
+    found = _rate(spec)
+    assert (found.per_second, found.guess) == (pytest.approx(rate), "")
+
+
+@pytest.mark.parametrize(
+    ("stated", "rate"),
+    [(125, 125.0), (np.float32(12.5), 12.5), (0.1, 0.1), (10_000, 10_000.0)]
+    + [
+        (wrong, None) for wrong in (None, 0, -5, math.nan, math.inf, "60", "x\n\x1b[2J", True, 10**400, 0.01, 1e9, [30])
+    ],
+)
+def test_rate_that_no_video_can_have_is_guessed_and_the_reason_names_it(stated: object, rate: float | None) -> None:
+    environment = Picture()
+    environment.metadata = {"render_fps": stated}
+    found = frame_rate(environment)
+    if rate is not None:
+        assert found == (rate, "")
+        return
+    assert found.per_second == 30.0
+    assert "30 frames a second are a guess" in found.guess
+    assert ("states no render_fps" if stated is None else bounded_text(repr(stated), 60)) in found.guess
+    assert found.guess.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("wrap", "rate", "guess"),
+    [
+        ("with_skipped_frames", 12.5, False),
+        ("with_skipped_frames_that_it_states", 10.0, False),
+        ("with_a_rate_of_its_own", 7.0, False),
+        ("without_rate", 30.0, True),
+    ],
+)
+def test_wrapper_of_the_user_may_skip_frames_and_change_the_rate(wrap: str, rate: float, guess: bool) -> None:
+    found = _rate(EnvironmentSpec(id="CartPole-v1", wrap=f"picture_environment:{wrap}"))
+    assert (found.per_second, bool(found.guess)) == (rate, guess)
+
+
 def test_camera_requires_one_environment() -> None:
     with pytest.raises(ValueError, match="a camera needs one environment"):
-        make_environments(_picture(), 2, render_mode="rgb_array", camera=lambda _: None)
+        make_environments(_picture(), 2, render_mode="rgb_array", camera=lambda *_: None)
 
 
 def test_camera_requires_an_environment_that_renders_images() -> None:
@@ -227,7 +304,7 @@ def test_camera_requires_an_environment_that_renders_images() -> None:
         (Broken(), r": render raises RuntimeError: no display \(.*test_gymnasium_backend.py, line \d+\)"),
         (Without(), " cannot render rgb_array images"),
     ):
-        filmed = RepeatedSteps(environment, "Mine-v0", repeat=1, no_reward_limit=None, camera=lambda _: None)
+        filmed = RepeatedSteps(environment, "Mine-v0", repeat=1, no_reward_limit=None, camera=lambda *_: None)
         with pytest.raises(EnvironmentSetupError, match=f"environment Mine-v0{reason}: a video of it cannot be recor"):
             filmed.reset()
 
@@ -235,7 +312,7 @@ def test_camera_requires_an_environment_that_renders_images() -> None:
 def test_environment_whose_constructor_takes_no_render_mode_cannot_be_filmed() -> None:
     spec = EnvironmentSpec(id="faulty_environments:Faulty-v0")
     with pytest.raises(EnvironmentSetupError, match="Faulty-v0 cannot render rgb_array images: its constructor has no"):
-        make_gymnasium(spec, 1, modules=FAULTY, render_mode="rgb_array", camera=lambda _: None)
+        make_gymnasium(spec, 1, modules=FAULTY, render_mode="rgb_array", camera=lambda *_: None)
 
 
 # ------------------------------------------------------------------------------------------------- processes

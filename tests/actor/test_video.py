@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from daedalus.actor.environments.rendering import FrameRate
 from daedalus.actor.evaluation.video import Video, VideoError
 
 FILES = ["film.mp4", "film.gif"]
@@ -23,9 +24,8 @@ def frame(number: int, height: int = 40, width: int = 60) -> np.ndarray:
 
 def record(path: Path, frames: int, frames_per_second: float, **options: float) -> Video:
     with Video(path, **options) as video:  # type: ignore[arg-type] - width is an int
-        video.frames_per_second = frames_per_second
         for number in range(frames):
-            video.add(frame(number))
+            video.add(frame(number), FrameRate(frames_per_second))
     return video
 
 
@@ -62,7 +62,7 @@ def test_mp4_has_every_frame_at_its_own_rate(tmp_path: Path) -> None:
 
 def test_mp4_has_even_sizes(tmp_path: Path) -> None:
     with Video(tmp_path / "film.mp4") as video:
-        video.add(frame(0, 41, 61))
+        video.add(frame(0, 41, 61), FrameRate())
     assert read_mp4(tmp_path / "film.mp4")[0][0].shape == (40, 60, 3)
     record(tmp_path / "small.mp4", 2, 30, width=30)
     assert read_mp4(tmp_path / "small.mp4")[0][0].shape == (20, 30, 3)
@@ -85,7 +85,7 @@ def test_gif_keeps_every_nth_frame_and_the_total_duration(
 
 def test_gif_is_small_unless_a_width_is_given(tmp_path: Path) -> None:
     with Video(tmp_path / "film.gif") as video:
-        video.add(np.zeros((400, 640, 3), np.uint8))
+        video.add(np.zeros((400, 640, 3), np.uint8), FrameRate())
     assert read_gif(tmp_path / "film.gif")[0][0].shape == (200, 320, 3)
     record(tmp_path / "small.gif", 1, 30, width=30)
     assert read_gif(tmp_path / "small.gif")[0][0].shape == (20, 30, 3)
@@ -94,17 +94,16 @@ def test_gif_is_small_unless_a_width_is_given(tmp_path: Path) -> None:
 def test_gif_stores_only_the_pixels_that_change(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8)
     with Video(tmp_path / "film.gif") as video:
-        video.frames_per_second = 15
         for number in range(10):
             noise[:8, :8] = 25 * number
-            video.add(noise)
+            video.add(noise, FrameRate(15))
         for _ in range(10):
-            video.add(noise)
+            video.add(noise, FrameRate(15))
     pictures, _ = read_gif(tmp_path / "film.gif")
     assert len(pictures) == 20
     assert (pictures[15][:8, :8] == 225).all()
     with Video(tmp_path / "still.gif") as video:
-        video.add(noise)
+        video.add(noise, FrameRate())
     still = (tmp_path / "still.gif").stat().st_size
     assert (tmp_path / "film.gif").stat().st_size < still + 19 * 500
 
@@ -112,10 +111,35 @@ def test_gif_stores_only_the_pixels_that_change(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", FILES)
 def test_recording_ends_after_max_seconds(tmp_path: Path, name: str) -> None:
     assert record(tmp_path / name, 60, 30, max_seconds=0.5).frames == 15
+    assert record(tmp_path / f"rounded-{name}", 60, 10, max_seconds=0.3).frames == 3
     if name.endswith("mp4"):
         assert len(read_mp4(tmp_path / name)[0]) == 15
     else:
-        assert sum(read_gif(tmp_path / name)[1]) == pytest.approx(500, abs=40)
+        assert sum(read_gif(tmp_path / name)[1]) == 500
+
+
+@pytest.mark.parametrize(
+    ("frames", "rate"), [(1, 125), (2, 125), (5, 50), (77, 125), (60, 29.97), (3, 0.5), (40, 5000)]
+)
+def test_video_plays_as_long_as_its_frames(tmp_path: Path, frames: int, rate: float) -> None:
+    assert record(tmp_path / "film.mp4", frames, rate).seconds == pytest.approx(frames / rate)
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        assert container.duration is not None
+        assert container.duration / 1e6 == pytest.approx(frames / rate, rel=0.01)
+    film = record(tmp_path / "film.gif", frames, rate)
+    shown = read_gif(tmp_path / "film.gif")[1]
+    assert sum(shown) == pytest.approx(film.seconds * 1000)
+    assert film.seconds == pytest.approx(frames / rate, abs=0.02)
+    assert min(shown) >= 20  # browsers show an image of 10 ms for 100
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_rate_of_the_second_frame_is_that_of_the_video(tmp_path: Path, name: str) -> None:
+    with Video(tmp_path / name) as video:
+        video.add(frame(0), FrameRate(60))
+        for number in range(1, 20):
+            video.add(frame(number), FrameRate(10))
+    assert video.seconds == 2
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -123,7 +147,7 @@ def test_exception_leaves_no_file_and_keeps_an_earlier_one(tmp_path: Path, name:
     def fail() -> None:
         with Video(tmp_path / name) as video:
             for number in range(40):
-                video.add(frame(number))
+                video.add(frame(number), FrameRate())
             raise RuntimeError("the engine stalled")
 
     with pytest.raises(RuntimeError, match="stalled"):
@@ -139,9 +163,8 @@ def test_exception_leaves_no_file_and_keeps_an_earlier_one(tmp_path: Path, name:
 def test_frames_are_written_while_recording(tmp_path: Path, name: str) -> None:
     random = np.random.default_rng(1)
     with Video(tmp_path / name) as video:
-        video.frames_per_second = 10
         for _ in range(150):
-            video.add(random.integers(0, 256, (100, 100, 3), np.uint8))
+            video.add(random.integers(0, 256, (100, 100, 3), np.uint8), FrameRate(10))
         (beside,) = tmp_path.iterdir()
         written = beside.stat().st_size
     assert written > (tmp_path / name).stat().st_size / 4
@@ -152,7 +175,7 @@ def test_invalid_frames_are_reported(tmp_path: Path, name: str) -> None:
     def write(*frames: np.ndarray) -> None:
         with Video(tmp_path / name) as video:
             for picture in frames:
-                video.add(picture)
+                video.add(picture, FrameRate())
 
     with pytest.raises(VideoError, match="no frame was recorded"):
         write()

@@ -10,6 +10,7 @@ from browser import AXE, chromium
 from recorded_runs import record
 from test_report_command import GIF, HOSTILE, evaluated, happened
 
+from daedalus.actor.environments.rendering import FrameRate
 from daedalus.actor.evaluation.video import Video
 from daedalus.cli.commands.report import report
 
@@ -30,7 +31,7 @@ def reports(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> list[Path
     pytest.importorskip("av")
     with Video(rich / "replay.mp4") as video:
         for shade in range(20):
-            video.add(np.full((64, 64, 3), 10 * shade, np.uint8))
+            video.add(np.full((64, 64, 3), 10 * shade, np.uint8), FrameRate())
     poor = record(folder / "poor", evaluation=None, finished=False)
     (poor / "replay.gif").write_bytes(GIF)
     record(folder / "other", settings=["collection.rollout_length=7"], returns=[None, None, 1.0])

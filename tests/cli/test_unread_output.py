@@ -1,10 +1,12 @@
-"""Commands whose output is not read to its end, as in `daedalus status | head`."""
+"""Commands whose output is not read to its end, as in `daedalus status | head`, or cannot be encoded."""
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from recorded_runs import record
 
 from daedalus.cli.processes import UNREAD, exit_status
 
@@ -58,3 +60,41 @@ def test_a_finished_run_does_not_fail_because_its_result_cannot_be_printed(buffe
     assert result.stderr == (
         "daedalus resume: cannot print the result, which is in the run directory: No space left on device\n"
     )
+
+
+NAME = (
+    "r\u00e9\udcff\u202e\u2028$x\x1b[2J"  # of a directory: an accent, a byte, marks of direction, a new line, a control
+)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8", "latin-1:strict"])
+def test_a_command_prints_any_path_in_characters_that_its_output_has(tmp_path: Path, encoding: str) -> None:
+    variables = {**os.environ, "PYTHONIOENCODING": encoding, "LC_ALL": "C.UTF-8"}
+
+    def run(*words: str) -> tuple[int, str]:
+        command = [sys.executable, "-P", "-c", PROGRAM, *words]
+        ended = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, check=False)
+        text = (ended.stdout + ended.stderr).decode(encoding.partition(":")[0])
+        assert "Traceback" not in text
+        assert all(line.isprintable() for line in text.split("\n")), text
+        return ended.returncode, text
+
+    if encoding == "ascii":
+        budget = ("--actors", "1", "--env-steps", "500", "--set", "evaluation.final_episodes=1", "--log-json")
+        status, text = run("train", "--env", "CartPole-v1", *budget, "--run-dir", NAME)
+        assert (status, "finished" in text) == (0, True), text
+    else:
+        record(tmp_path / NAME)
+    status, text = run("report", NAME)
+    assert (status, text.strip()) == (
+        0,
+        r"wrote r\xe9\udcff\u202e\u2028$x\x1b[2J/report.html".replace(r"\xe9", r"\xe9" if encoding == "ascii" else "é"),
+    )
+    page = (tmp_path / NAME / "report.html").read_text("utf-8")
+    assert all(character.isprintable() or character == "\n" for character in page)
+    assert run("plot", NAME, "--output", f"{NAME}.png")[0] == 0
+    assert run("compare", NAME, "--csv", f"{NAME}.csv")[0] == 0
+    assert all(line.isprintable() for line in (tmp_path / f"{NAME}.csv").read_text("utf-8").splitlines())
+    assert run("evaluate", f"{NAME}-missing")[0] == 1
+    assert run("resume", f"{NAME}-missing")[0] == 2
+    assert run("status", "--alive", f"{NAME}-missing")[0] == 1

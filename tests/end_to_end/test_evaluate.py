@@ -238,6 +238,22 @@ def test_a_video_has_every_frame_before_action_repeat(tmp_path: Path, evaluate: 
     assert evaluate(run, "--episodes", 1, "--seed", 2)["returns"] == result["returns"]
 
 
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif"])
+def test_a_video_plays_at_the_speed_of_the_environment_or_a_note_says_that_it_is_guessed(
+    tmp_path: Path, evaluate: Callable[..., dict], name: str
+) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    options = ("--video", tmp_path / name, "--seed", 1, "--wrap")
+    slow = evaluate(run, *options, "picture_environment:with_a_rate_of_its_own", "--max-seconds", 0.5)
+    assert slow["video_seconds"] == pytest.approx(4 / 7, abs=0.005)
+    assert slow["notes"] == ["the last episode was cut at the end of the video"]
+    guessed = evaluate(run, *options, "picture_environment:without_rate")
+    assert guessed["video_seconds"] == pytest.approx((guessed["lengths"][0] + 1) / 30, abs=0.005)
+    assert guessed["notes"] == [
+        "the speed of the video: the environment states no render_fps: 30 frames a second are a guess"
+    ]
+
+
 def test_a_recorded_evaluation_replaces_that_of_the_run(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     write_config(run, RunSpec(environment=CARTPOLE))

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daedalus.protocol.texts import bounded_text, short_number
+from daedalus.protocol.texts import bounded_text, one_line, printable, short_number
 
 offline = settings(max_examples=200, deadline=None, derandomize=True)
 
@@ -32,6 +32,27 @@ def test_any_text_becomes_printable_and_small(text: str, most: int) -> None:
     assert bounded.isprintable()
     assert len(bounded.encode()) <= most
     assert bounded_text(bounded, most) == bounded.rstrip()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("é ± 日本 \U0001f600\tand\nmore", "é ± 日本 \U0001f600\tand\nmore"),
+        ("\x1b[2J\r\x7f\x9b\0", r"\x1b[2J\r\x7f\x9b\x00"),
+        ("a\u202eb\u2066c\u200b\ufeff", r"a\u202eb\u2066c\u200b\ufeff"),
+        ("a\u2028b\u2029c\x85d", r"a\u2028b\u2029c\x85d"),
+        ("\udcff\ud800 \U000e0041", r"\udcff\ud800 \U000e0041"),
+    ],
+)
+def test_what_is_not_printable_is_escaped(text: str, expected: str) -> None:
+    assert printable(text) == expected
+
+
+@offline
+@given(text=st.text())
+def test_any_text_becomes_printable(text: str) -> None:
+    assert printable(text).replace("\n", "").replace("\t", "").isprintable()
+    assert one_line(text).isprintable()
 
 
 SHOWN = {0.0: "0", 1.2e-5: "1.2e-05", -0.0345: "-0.0345", 0.98765: "0.988", -475.25: "-475.2", 1e6: "1,000,000"} | {
