@@ -23,6 +23,7 @@ STOPPED = 128 + signal.SIGTERM
 ORDERED = 4  # exit status of a supervised learner that an operator stopped
 RANK_LOST = 5  # exit status of a process of a learner that has lost another one; restarted, it goes on
 UNSAVED = 6  # exit status of a supervised learner whose last checkpoint could not be saved
+SUPERSEDED = 7  # exit status of a learner that a newer one of its run has replaced: it must not be started again
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
 UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # errors of a full disk, and of a terminal that was closed
 _STUCK_SECONDS = 4.0  # in one call after a signal: a process that is stuck ends within 5 s

@@ -28,6 +28,7 @@ from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
     ORDERED,
     STOPPED,
+    SUPERSEDED,
     UNSAVED,
     exit_on_thread_exceptions,
     exit_status,
@@ -169,6 +170,10 @@ class _Command:
             stack.enter_context(run_directory.made(run.directory))  # before a router is waited for, for status --alive
         Heartbeat(run.directory).clear()
         resumed = arguments.resume and run.exists
+        if resumed and (reason := run_directory.why_superseded(run.directory)):
+            print_error("learner", reason)
+            self.ranks.dismiss(run.spec, self.stop)
+            return SUPERSEDED
         finished = finished_run(run.directory, run.spec) if resumed else None
         if finished is not None:
             _logger.info("nothing to do: %s", finished.reason)
@@ -197,6 +202,8 @@ class _Command:
             if arguments.prepared is None:  # else the launcher starts them
                 _start_trackers(run.directory, arguments, self.progress, self.stop, stack)
             outcome = service.run()
+            if outcome.superseded_by is not None:
+                _note_superseded(run.directory, outcome.superseded_by)
         except _FAILURES:
             if not run.exists:
                 run_directory.remove_failed(run.directory)
@@ -285,11 +292,20 @@ def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
     return restored
 
 
+def _note_superseded(directory: Path, learner_epoch: int) -> None:
+    try:
+        run_directory.note_superseded(directory, learner_epoch)
+    except OSError as error:
+        _logger.error("%s cannot be written, so do not start this learner again: %s", directory, error.strerror)
+
+
 def _status(outcome: Outcome, spec: RunSpec, stopped: int, unsaved: int) -> int:
     """Return the exit status for the end of a run.
 
     `stopped` is that of a run that was stopped, and `unsaved` that of a run whose last checkpoint could not be saved.
     """
+    if outcome.superseded_by is not None:
+        return SUPERSEDED
     if not outcome.saved:
         return unsaved
     if not outcome.finished:
