@@ -62,7 +62,8 @@ class TrainingLoop:
     def run(self, records: RunRecords, *, resumed: bool) -> float:
         """Train until the target is reached, the budget is used or the stop event is set.
 
-        `resumed`: the run continues from a checkpoint. Return when training ended, on the monotonic clock: before the target was confirmed.
+        Return when training ended, on the monotonic clock: before the target was confirmed. `resumed` says that the run
+        continues from a checkpoint.
         """
         training, service = self._state.spec.training, self._state.spec.service
         now = time.monotonic()

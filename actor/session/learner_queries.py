@@ -52,8 +52,10 @@ class LearnerQueries:
         """Send requests to join until a learner of `run` (`*`: of any run) answers.
 
         While several learners of one run answer, wait for the older ones to step down, for at most 5 s: they would
-        answer queries that are meant for the newest. Raises RunOverError on a local stop or if the run is over; ActorError if refused, or after `timeout` seconds
-        without an answer.
+        answer queries that are meant for the newest.
+
+        Raises RunOverError on a local stop or if the run is over; NoLearnerError after `timeout` seconds without an
+        answer; another ActorError if refused.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         pause, logged, log_at = _FIRST_RETRY_SECONDS, "", 0.0

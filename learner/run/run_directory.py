@@ -221,8 +221,8 @@ def why_superseded(directory: Path) -> str:
     with suppress(SettingsError):
         if newer := read_json(directory / SUMMARY).get(_SUPERSEDED):
             return (
-                f"{directory}: a newer learner of this run (epoch {newer}) took over from the learner here: the run goes "
-                f"on in the directory of that one. To continue this copy all the same, remove {directory / SUMMARY}"
+                f"{directory}: a newer learner of this run (epoch {newer}) took over: the run goes on in "
+                f"the directory of that one. To continue this copy all the same, remove {directory / SUMMARY}"
             )
     return ""
 

@@ -180,8 +180,8 @@ class ActorServer:
         self._orders.step_down(newer)
         self.close("a newer learner of this run has taken over")
         _logger.warning(
-            "a newer learner of run %r answers (epoch %x; this one is %x): this learner steps down, and the run goes on "
-            "there. If that is another run, rename one of the two (the last part of --run-dir)",
+            "a newer learner of run %r answers (epoch %x; this one is %x): this learner steps down, and the run goes "
+            "on there. If that is another run, rename one of the two (the last part of --run-dir)",
             self._run,
             newer,
             self._epoch,

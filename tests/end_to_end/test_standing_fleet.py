@@ -42,7 +42,8 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
     """The older learner is cut off from the router while the copy starts, and returns."""
     start("router", "--listen", address).expect("listening")
     learner = ("learner", "cartpole", "--connect", address, "--resume", "--run-dir")
-    often = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9, "--set", "service.checkpoint_seconds=0.2")
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    often = (*endless, "--set", "service.checkpoint_seconds=0.2")
     older = start(*learner, "one/sb", *often)
     actors = [start("actor", "--connect", address, "--name", "leaves", "--envs", 4)]
     actors.append(start("actor", "--connect", address, "--name", "stays", "--envs", 4, "--run", "sb", "--stay"))
@@ -67,4 +68,4 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
     assert json.loads(line)["actors_alive"] == 2
     again = start(*learner, "one/sb", *often)  # as by a supervisor
     assert again.wait() == 7
-    again.expect(r"one/sb: a newer learner of this run \(epoch [0-9a-f]+\) took over .* remove one/sb/summary.json")
+    again.expect(r"one/sb: a newer learner of this run \(epoch [0-9a-f]+\) took over: .* remove one/sb/summary.json")
