@@ -5,6 +5,7 @@ import time
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser, seconds
 from daedalus.cli.logs import print_error
+from daedalus.cli.processes import status_at_start
 from daedalus.cli.status_query import ask, decoded, newest_of_each_run, no_answer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
@@ -16,7 +17,7 @@ from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
-LEFT, FAILED, BAD_USAGE = 0, 1, 2
+LEFT, FAILED = 0, 1
 
 _DESCRIPTION = """\
 Asks actors to leave. Each actor ends with exit status 0 as soon as the learner has judged its current rollout, also if
@@ -58,7 +59,7 @@ def drain(arguments: list[str]) -> int:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except (ValueError, *SECURITY_ERRORS) as error:
         print_error("drain", error)
-        return BAD_USAGE
+        return status_at_start(error)
     try:
         transport = connect_until_interrupted(parsed.connect, credentials)
         try:

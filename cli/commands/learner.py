@@ -2,10 +2,10 @@
 
 Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed, or the last checkpoint could not be
-saved; 2 bad usage. Under `daedalus train` a learner that a signal stopped exits with processes.STOPPED, and one that an
-operator stopped with processes.ORDERED. A supervised learner whose last checkpoint could not be saved exits with
-processes.UNSAVED. A learner of several processes that has lost one exits with processes.RANK_LOST, and is then started
-again.
+saved; 2 bad usage; 7 a newer learner of the run has taken over. Under `daedalus train` a learner that a signal stopped
+exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED. A supervised learner whose last
+checkpoint could not be saved exits with processes.UNSAVED. A learner of several processes that has lost one exits with
+processes.RANK_LOST, and is then started again.
 """
 
 import argparse
@@ -26,6 +26,8 @@ from daedalus.cli.learner_network import announce, learner_credentials, open_tra
 from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
+    BAD_USAGE,
+    FAILED,
     ORDERED,
     STOPPED,
     SUPERSEDED,
@@ -34,6 +36,7 @@ from daedalus.cli.processes import (
     exit_status,
     exit_with_parent,
     raise_descriptor_limit,
+    status_at_start,
     stop_on_signals,
 )
 from daedalus.cli.quick_check import expected_defaults, expected_spaces
@@ -75,7 +78,7 @@ _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it r
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
-REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
+REACHED, NOT_REACHED = 0, 3
 _FAILURES = (
     AlgorithmError,
     CheckpointMismatchError,
@@ -115,7 +118,7 @@ def main() -> int:
         return BAD_USAGE
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print_error("learner", error)
-        return BAD_USAGE
+        return status_at_start(error)
     display = SilentProgress if arguments.no_progress else Progress
     progress = display(sys.stdout, run.spec.training.env_steps)
     context = {"run": run_directory.run_name(run.directory)}
