@@ -12,6 +12,10 @@ class LearnerLostError(Exception):
         super().__init__(reason)
 
 
+class NoLearnerError(ActorError):
+    """No learner answered within the time that the user set."""
+
+
 class ActorRefusedError(ActorError):
     """The learner refused or quarantined the actor."""
 

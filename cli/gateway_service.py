@@ -31,6 +31,7 @@ from daedalus.protocol.orders import Order
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.retries import Retries
 
 _logger = logging.getLogger("daedalus.cli")
 
@@ -141,10 +142,20 @@ class GatewayService:
 
     async def _connect(self, credentials: Credentials | None) -> Transport | None:
         """Return a transport once the network is reached, or None if stopped before."""
-        transport = await asyncio.to_thread(connect_with_retry, self._settings.connect, self._stop, None, credentials)
+        transport = await asyncio.to_thread(self._await_network, credentials)
         if transport is not None:
             self._transports.callback(transport.close)
         return transport
+
+    def _await_network(self, credentials: Credentials | None) -> Transport | None:
+        """See _connect. A certificate that is refused may be renewed, here or at the router."""
+        retries = Retries(self._stop)
+        while True:
+            try:
+                return connect_with_retry(self._settings.connect, self._stop, None, credentials)
+            except TransportError as error:
+                if retries.wait(str(error)):
+                    return None
 
     def _begin_to_watch(self, transport: Transport, gateway: Gateway) -> None:
         source = LearnerSource(transport, self._settings.run, lambda: gateway.run.name)

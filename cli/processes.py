@@ -16,15 +16,20 @@ from typing import NoReturn, TextIO
 
 from daedalus.policy.user_code import frames_of, is_of_user
 from daedalus.protocol.texts import printable
+from daedalus.transport.credentials import NotValidNowError
 from daedalus.transport.slow_calls import in_progress
 
 _logger = logging.getLogger(__name__)
 
+# Exit statuses of every command; docs/operations.md has the table of all. A supervisor starts a process that failed
+# again, and not one that was started wrongly: that fails each time.
+FAILED, BAD_USAGE = 1, 2
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
 STOPPED = 128 + signal.SIGTERM
 ORDERED = 4  # exit status of a supervised learner that an operator stopped
 RANK_LOST = 5  # exit status of a process of a learner that has lost another one; restarted, it goes on
 UNSAVED = 6  # exit status of a supervised learner whose last checkpoint could not be saved
+SUPERSEDED = 7  # exit status of a learner that a newer one of its run has replaced: it must not be started again
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
 UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # errors of a full disk, and of a terminal that was closed
 _STUCK_SECONDS = 4.0  # in one call after a signal: a process that is stuck ends within 5 s
@@ -34,6 +39,14 @@ _LAST_WORD_SECONDS = 0.5  # for a last line that may block
 _TRACEBACK_SECONDS = 5.0  # for a traceback that may block
 _LONGEST_LINE = 1 << 16  # bytes, from the parent
 _MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
+
+
+def status_at_start(error: Exception) -> int:
+    """Return the exit status of a process that cannot start: BAD_USAGE, unless only the certificate is not valid now.
+
+    It may be renewed, or the clock corrected, so that the same command works.
+    """
+    return FAILED if isinstance(error, NotValidNowError) else BAD_USAGE
 
 
 def raise_descriptor_limit() -> None:

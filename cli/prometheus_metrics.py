@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
+from daedalus.cli.status_query import newest_of_each_run
 from daedalus.protocol.status import ActorStatus, RunStatus
 
 _Family = type[CounterMetricFamily] | type[GaugeMetricFamily]
@@ -106,22 +107,25 @@ def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
     """Yield all metrics of the runs that answered, or only `daedalus_up` 0 if no run answered.
 
     Actors that are gone have no series of their own. They are only counted, by their state, and after a minute only in
-    the counters of the run.
+    the counters of the run. Of several learners of one run, the newest has series.
     """
-    runs = list({status.run: status for status in statuses}.values())
+    statuses = list(statuses)
+    runs = newest_of_each_run(statuses)
     yield GaugeMetricFamily("daedalus_up", "1 if a learner answers, else 0.", value=bool(runs))
     info = GaugeMetricFamily(
         "daedalus_run_info", "Environment and algorithm of the run.", labels=["run", "environment", "algorithm"]
     )
+    learners = GaugeMetricFamily("daedalus_learners", "Learners of the run that answer.", labels=["run"])
     actors = GaugeMetricFamily("daedalus_actors", "Actors by state.", labels=["run", "state"])
     rejected = CounterMetricFamily("daedalus_rollouts_rejected", "Rejected rollouts by cause.", labels=["run", "cause"])
     for run in runs:
         info.add_metric([run.run, run.environment, run.algorithm], 1)
+        learners.add_metric([run.run], sum(status.run == run.run for status in statuses))
         for state, count in _states(run).items():
             actors.add_metric([run.run, state], count)
         for cause, count in sorted(run.rollouts_rejected.items()):
             rejected.add_metric([run.run, cause], count)
-    yield from (info, actors, rejected)
+    yield from (info, learners, actors, rejected)
     for kind, name, text, value_of in _OF_A_RUN:
         family = kind(f"daedalus_{name}", text, labels=["run"])
         for run in runs:

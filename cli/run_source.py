@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from daedalus.cli.status_query import ask, ask_events
+from daedalus.cli.status_query import ask, ask_events, decoded, newest_of_each_run
 from daedalus.protocol import keys
-from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, METRICS_LIMITS
 from daedalus.protocol.messages import Acknowledgement, Refusal
 from daedalus.protocol.metrics import MetricsReport, MetricsRequest
@@ -30,7 +30,7 @@ class LearnerSource:
 
     def status(self, max_actors: int) -> RunStatus | None:
         """See RunSource."""
-        statuses = ask(self._transport, self._run, max_actors=max_actors)
+        statuses = newest_of_each_run(ask(self._transport, self._run, max_actors=max_actors))
         chosen = self._chosen()
         return min(statuses, key=lambda status: (status.run != chosen, status.run), default=None)
 
@@ -41,19 +41,18 @@ class LearnerSource:
     def metrics(self, status: RunStatus, first: int) -> MetricsReport | None:
         """See RunSource."""
         request = encode(MetricsRequest(first=first))
-        for answer in self._transport.query(keys.status(status.run), request, timeout=_ANSWER_SECONDS):
-            report = decode(answer, METRICS_LIMITS)
-            if isinstance(report, MetricsReport) and report.page.learner_epoch == status.learner_epoch:
+        answers = self._transport.query(keys.status(status.run), request, timeout=_ANSWER_SECONDS)
+        for report in decoded(answers, MetricsReport, METRICS_LIMITS):
+            if report.page.learner_epoch == status.learner_epoch:
                 return report
         return None
 
     def order(self, status: RunStatus, order: Order) -> str:
         """See RunSource."""
         request = encode(OrderRequest(order=order))
-        for answer in self._transport.query(keys.orders(status.run), request, timeout=_ANSWER_SECONDS):
-            match decode(answer, ACKNOWLEDGEMENT_LIMITS):
-                case Acknowledgement(verdict="accepted"):
-                    return ""
-                case Refusal(reason=reason):
-                    return reason
+        answers = self._transport.query(keys.orders(status.run), request, timeout=_ANSWER_SECONDS)
+        if decoded(answers, Acknowledgement, ACKNOWLEDGEMENT_LIMITS):
+            return ""
+        for refusal in decoded(answers, Refusal, ACKNOWLEDGEMENT_LIMITS):
+            return refusal.reason
         return "the learner does not answer: try again later"

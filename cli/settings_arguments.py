@@ -46,7 +46,8 @@ examples:
   daedalus learner --run-dir runs/mine --resume --env-steps 3000000      (the whole budget, with the steps already done)
 
 exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
-and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage"""
+and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage;
+7 a newer learner of the run has taken over"""
 
 
 def add_settings(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from daedalus.cli.child_output import inherited
 from daedalus.cli.logs import configure_logging, print_error
-from daedalus.cli.processes import UNSAVED
+from daedalus.cli.processes import SUPERSEDED, UNSAVED
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
@@ -18,7 +18,7 @@ from daedalus.learner.run.settings import SettingsError
 _logger = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.05
-_ENDED = {0, 3, UNSAVED}  # exit statuses of a learner that is not restarted
+_ENDED = {0, 3, UNSAVED, SUPERSEDED}  # exit statuses of a learner that is not restarted
 _FAILED = 1
 _END_SECONDS = 30.0  # for the learner to save its checkpoint on a busy machine: it ends its processes within 5 s itself
 

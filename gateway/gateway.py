@@ -49,7 +49,7 @@ class Gateway:
         Args:
           transport: the network; the caller closes it.
           config: settings.
-          on_failure: called on the event loop with what ends the link or the policy: the gateway cannot go on.
+          on_failure: called on the event loop with a fault of ours: the gateway cannot go on.
         """
         self._transport, self._config, self._on_failure = transport, config, on_failure
         self._loop = asyncio.get_running_loop()
@@ -63,7 +63,9 @@ class Gateway:
         self._joining = Joining(transport, self._link, self.run)
         self._versions = PolicyVersions()
         self._seats: dict[str, Seat] = {}  # by the name towards the learner
-        self._batcher = Batcher(lambda: self._versions.current, lambda: len(self._seats), on_failure, self._on_fault)
+        self._batcher = Batcher(
+            lambda: self._versions.current, lambda: len(self._seats), self._link.fail, self._on_fault
+        )
         self._outbox = Outbox()
         self._sender = Sender(transport, lambda error: self._post(on_failure, error))
         self._parked = ParkedActors(MAX_CLIENTS)

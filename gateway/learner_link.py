@@ -7,17 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from daedalus.actor.errors import LearnerLostError
+from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.learner_presence import LearnerPresence
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.gateway.policy_versions import PolicyVersion
-from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Snapshot, Welcome
-from daedalus.transport.interface import Transport
+from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.retries import Retries
 
 _logger = logging.getLogger(__name__)
 
@@ -49,7 +50,7 @@ class LinkEvents(Protocol):
         ...
 
     def on_run_over(self, reason: str) -> None:
-        """The run has ended; another is looked for."""
+        """The run has ended, or this gateway cannot take part in it; another learner is looked for."""
         ...
 
 
@@ -74,20 +75,31 @@ class LearnerLink:
         self._end = RunEndWatch(transport, stop)
         self._feed = SnapshotFeed(transport, self.queries, self._end, join.actor, self.presence.heard)
         self._watched: set[str] = set()
+        self._failure: PolicyError | None = None  # of the policy, when it acted
         self._look_again = False  # an actor was fenced: another learner may have begun
         self._fetch_wanted = False
+        self._follows = False  # whether `events` knows of the present learner
         self.newest_policy: NewestPolicy | None = None
 
     def look_again(self) -> None:
         """Look for the learner: an actor was fenced. From any thread."""
         self._look_again = True
 
+    def fail(self, error: PolicyError) -> None:
+        """Leave the learner: its policy does not run. From any thread."""
+        self._failure = error
+
     def fetch(self) -> None:
         """Ask the learner for a newer snapshot, although no client has heard of one. From any thread."""
         self._fetch_wanted = True
 
     def run(self) -> None:
-        """Follow learners until `stop` is set. Raises ActorError, PolicyError or TransportError."""
+        """Follow learners until `stop` is set.
+
+        Somebody else can remove what keeps the gateway from a run, such as a second run or a policy that does not run:
+        the gateway reports it to the learner, if there is one, and tries again.
+        """
+        retries = Retries(self._stop)
         while not self._stop.is_set():
             try:
                 session = self.queries.join_learner(self._run_to_join, self._join, None, self._end)
@@ -99,11 +111,19 @@ class LearnerLink:
                 if not error.finished:
                     return
                 self._events.on_run_over(str(error))
+                retries.succeeded()
                 self._stop.wait(_NEXT_RUN_SECONDS)
+            except (ActorError, PolicyError, TransportError) as error:
+                self.queries.report_failure(self._end.run, self._join, error)
+                if self._follows:
+                    self._events.on_run_over(str(error))
+                retries.wait(str(error))
+            finally:
+                self._follows = False
 
     def _follow(self, session: Welcome) -> None:
         """Serve one session until something raises."""
-        self._look_again = False
+        self._look_again, self._failure = False, None
         self._end.follow(session.run, session.learner_epoch)
         if session.run not in self._watched:
             self._watched.add(session.run)
@@ -112,6 +132,7 @@ class LearnerLink:
         self._feed.begin(session)
         self._feed.subscribe()
         self._events.on_learner(session)
+        self._follows = True
         program = self._await_program(session.run)
         policy = OnnxRuntime(program, self._stop)
         self._await_snapshot()
@@ -170,6 +191,8 @@ class LearnerLink:
             raise LearnerLostError("the learner was stopped; waiting for it to return")
         if left or self._look_again:
             raise LearnerLostError
+        if self._failure is not None:
+            raise self._failure
         if time.monotonic() > self.presence.heard_at + _SILENCE_SECONDS:
             if not self.queries.learner_responds(self._end.run, self._join):
                 raise LearnerLostError

@@ -57,6 +57,7 @@ class Outcome:
     saved: bool  # whether the last checkpoint was saved, or there was nothing to save
     seconds_to_target: float | None  # seconds until the target return was reached; None if it was not
     ordered: bool = False  # whether an operator stopped the run
+    superseded_by: int | None = None  # epoch of a newer learner of this run, for which this one stepped down
 
 
 class LearnerService:
@@ -107,7 +108,8 @@ class LearnerService:
         self._restored, self._initial = restored, initial if restored is None else None
         self._allows_other_spaces = other_spaces
         self._ranks: OtherRanks | None = None  # None: not connected yet
-        self._state = RunState(directory, spec, started, certificate_days_left)
+        starts_before = restored.counters.get("starts", 0) if restored is not None else 0
+        self._state = RunState(directory, spec, started, certificate_days_left, starts_before)
         if restored is not None:
             self._state.restore(restored.counters, restored.policy.spec)
         self._heartbeat = Heartbeat(directory)
@@ -185,8 +187,14 @@ class LearnerService:
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
-        ordered = self._orders.stopped
-        return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None, ordered=ordered)
+        return Outcome(
+            solved=False,
+            finished=False,
+            saved=True,
+            seconds_to_target=None,
+            ordered=self._orders.stopped,
+            superseded_by=self._orders.superseded_by,
+        )
 
     def _load(self, learner: "Learner", spaces: Spaces) -> None:
         """Begin with the weights of a checkpoint or of another run, if any. Raises CheckpointMismatchError."""
@@ -252,7 +260,7 @@ class LearnerService:
         self._reporter.begin(time.monotonic())
         finished, saved, ended = False, None, None
         try:
-            ended = loop.run(records)
+            ended = loop.run(records, resumed=self._restored is not None)
             finished = state.is_finished
         except RankLostError:
             if not self._stop.is_set():  # a signal may end all processes of the learner at once
@@ -278,6 +286,7 @@ class LearnerService:
             saved=saved is not None,
             seconds_to_target=state.counters.seconds_to_target,
             ordered=self._orders.stopped,
+            superseded_by=self._orders.superseded_by,
         )
 
     def _status(self) -> RunStatus:

@@ -1,6 +1,7 @@
 """The main loop of a learner process: update after update, and between them all that the learner's thread does."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -58,14 +59,17 @@ class TrainingLoop:
             self._server.publisher.extras = lambda: learner.gradient_inputs(self._state.progress)
         self._server.publisher.publish(learner.policy_version, learner.weights())
 
-    def run(self, records: RunRecords) -> float:
+    def run(self, records: RunRecords, *, resumed: bool) -> float:
         """Train until the target is reached, the budget is used or the stop event is set.
 
-        Return when training ended, on the monotonic clock: before the target was confirmed.
+        Return when training ended, on the monotonic clock: before the target was confirmed. `resumed` says that the run
+        continues from a checkpoint.
         """
         training, service = self._state.spec.training, self._state.spec.service
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
+        # A copy of the run directory must have a newer epoch than a learner that has resumed here: save its count soon.
+        soon_after = self._learner.policy_version if resumed else math.inf
         while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
             self._beat()
             self._update()
@@ -78,8 +82,9 @@ class TrainingLoop:
             if now >= log_at:
                 records.record(self._learner, now)
                 log_at = now + service.log_seconds
-            if now >= save_at or self._orders.take_checkpoint():
+            if self._orders.take_checkpoint() or now >= save_at or self._learner.policy_version > soon_after:
                 self._checkpointer.save()
+                soon_after = math.inf
                 save_at = time.monotonic() + service.checkpoint_seconds
         return time.monotonic()
 

@@ -8,7 +8,7 @@ from functools import partial
 
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.transport.credentials import Credentials
-from daedalus.transport.interface import RefusedError, Transport, TransportError
+from daedalus.transport.interface import RefusedError, Transport, TransportError, UnreachableError
 from daedalus.transport.slow_calls import SlowCall
 from daedalus.transport.zenoh_transport import connect, listen
 
@@ -41,7 +41,7 @@ def connect_with_retry(
 ) -> Transport | None:
     """Retry `connect` until it succeeds, and log once that it waits; return None if `stop` is set first.
 
-    Raises TransportError after `timeout` seconds, and RefusedError at once.
+    Raises UnreachableError after `timeout` seconds, and RefusedError at once.
     """
 
     def check() -> None:
@@ -61,7 +61,7 @@ def connect_with_retry(
             raise
         except TransportError as error:
             if deadline is not None and time.monotonic() > deadline:
-                raise TransportError(
+                raise UnreachableError(
                     f"{error} (for {timeout:g} s): is the learner running, and is this its address?"
                 ) from None
             if not logged and pause >= _MAX_PAUSE_SECONDS / 2:

@@ -35,6 +35,10 @@ class CredentialsError(Exception):
     """A folder of credentials that cannot be used; the message says why and what to do."""
 
 
+class NotValidNowError(CredentialsError):
+    """A certificate that has expired, or that is not valid yet by the clock of this host."""
+
+
 @dataclass(frozen=True, slots=True)
 class Credentials:
     """Verified credentials of one process: its role, and the name of an actor or operator."""
@@ -89,14 +93,14 @@ class Credentials:
     def check_expiry(self) -> None:
         """Raise CredentialsError if the certificate that is in the folder now has expired."""
         if self.days_left() < 0:
-            raise CredentialsError(f"{self.directory}: {_expired(self.directory)}")
+            raise NotValidNowError(f"{self.directory}: {_expired(self.directory)}")
 
 
 def load(directory: Path, *roles: str) -> Credentials:
     """Return the verified credentials in a folder.
 
-    Raises CredentialsError if a file is missing or damaged, the certificate is not valid now or not signed by the CA,
-    or its role is not one of `roles`.
+    Raises NotValidNowError, or CredentialsError if a file is missing or damaged, the certificate is not signed by the
+    CA, or its role is not one of `roles`.
     """
     subject = common_name_of(_verified(directory))
     role, _, name = subject.partition(":")
@@ -190,8 +194,9 @@ def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
         return _handshake(client, server)
     except ssl.SSLCertVerificationError as error:
         if "expired" in error.verify_message and not ignore_time:
-            raise CredentialsError(f"{directory}: {_expired(directory)}") from None
-        raise CredentialsError(f"{directory}: {CERTIFICATE}: {with_remedy(error.verify_message)}") from None
+            raise NotValidNowError(f"{directory}: {_expired(directory)}") from None
+        kind = NotValidNowError if "not yet valid" in error.verify_message else CredentialsError
+        raise kind(f"{directory}: {CERTIFICATE}: {with_remedy(error.verify_message)}") from None
     except ssl.SSLError:
         raise CredentialsError(f"{directory}: {CA} is damaged: copy it again") from None
 

@@ -22,6 +22,10 @@ class AddressInUseError(TransportError):
     """The address is in use by another process."""
 
 
+class UnreachableError(TransportError):
+    """Nothing answered within the time that the user set."""
+
+
 class RefusedError(TransportError):
     """The other end refuses this certificate, or its own certificate is not trusted: retrying will not help."""
 

@@ -3,6 +3,7 @@
 A session either embeds a full router that listens (the learner, by default) or is a client of a router.
 """
 
+import contextlib
 import json
 import re
 from collections.abc import Callable
@@ -36,7 +37,8 @@ def session_opener(
     """
     capacity = Capacity(message_bytes=max_message_bytes, descriptors=_descriptors())
     if credentials is not None:
-        credentials.warn_of_expiry()
+        with contextlib.suppress(CredentialsError):  # a file is being copied: opening the session says so
+            credentials.warn_of_expiry()
 
     def open_session() -> zenoh.Session:
         security = credentials.settings(listens=bool(listen_on)) if credentials else {}

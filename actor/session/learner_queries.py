@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError
+from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError, NoLearnerError
 from daedalus.actor.session.run_end import DRAINED, RunEndWatch, RunOverError
 from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
@@ -37,6 +37,7 @@ _POLL_SECONDS = 0.2  # how soon a wait notices `stop`
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
 _LOOK_AROUND_SECONDS, _MAX_RUNS = 10.0, 10  # between looks for other runs, and how many are named
+_STEP_DOWN_SECONDS = 5.0  # for the older of two learners of a run to notice the newer one
 _REOPEN_SECONDS = 5.0  # without an answer for so long, the session may be dead: open another
 
 
@@ -45,31 +46,42 @@ class LearnerQueries:
 
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
+        self._noted = ""  # the last warning of another release
 
     def join_learner(self, run: str, join: Join, timeout: float | None, end: RunEndWatch) -> Welcome:
         """Send requests to join until a learner of `run` (`*`: of any run) answers.
 
-        Raises RunOverError on a local stop or if the run is over; ActorError if refused, or after `timeout` seconds
-        without an answer.
+        While several learners of one run answer, wait for the older ones to step down, for at most 5 s: they would
+        answer queries that are meant for the newest.
+
+        Raises RunOverError on a local stop or if the run is over; NoLearnerError after `timeout` seconds without an
+        answer; another ActorError if refused.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         pause, logged, log_at = _FIRST_RETRY_SECONDS, "", 0.0
         reopen_at = time.monotonic() + _REOPEN_SECONDS
         name_free_by = time.monotonic() + _NAME_IN_USE_SECONDS
+        alone_by: float | None = None
         while True:
             end.check()  # a request may take 5 s
             awaited = ""
             try:
-                welcome = self.request_join(run, join)
+                welcomes = self._request_joins(run, join)
             except NameInUseError:
                 if time.monotonic() > (name_free_by if deadline is None else min(name_free_by, deadline)):
                     raise
-                welcome = None
+                welcomes = []
                 awaited = "the other actor of this name to leave"
-            if welcome is not None:
-                return welcome
-            if deadline is not None and time.monotonic() > deadline:
-                raise ActorError(f"no learner answered within {timeout:g} s: {self._remedy(run, join)}")
+            is_late = deadline is not None and time.monotonic() > deadline
+            if len(welcomes) > 1 and alone_by is None:
+                alone_by = time.monotonic() + _STEP_DOWN_SECONDS
+                _log_several(welcomes)
+            if len(welcomes) == 1 or (welcomes and (is_late or time.monotonic() > (alone_by or 0.0))):
+                return welcomes[0]
+            if welcomes:
+                awaited = "the older learner to step down"
+            elif is_late:
+                raise NoLearnerError(f"no learner answered within {timeout:g} s: {self._remedy(run, join)}")
             if pause >= _MAX_RETRY_SECONDS and time.monotonic() >= log_at:
                 log_at = time.monotonic() + _LOOK_AROUND_SECONDS
                 end.check()  # the request may have taken 5 s, and the next one may too
@@ -119,22 +131,29 @@ class LearnerQueries:
             pass  # no router now: the present session keeps trying
 
     def request_join(self, run: str, join: Join) -> Welcome | None:
-        """Send a request to join; return None if no learner is ready. Raises ActorError or RunOverError if refused."""
+        """Send a request to join; return the answer of the newest learner, or None if no learner is ready.
+
+        Raises ActorError or RunOverError if refused, and ActorError if learners of several runs answer.
+        """
+        return next(iter(self._request_joins(run, join)), None)
+
+    def _request_joins(self, run: str, join: Join) -> list[Welcome]:
+        """Send a request to join; return the answers of the learners of one run, the newest first. See request_join."""
         answers = self._ask(keys.join(run, join.actor), encode(join))
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
-        if len(welcomes) > 1:
-            names = ", ".join(sorted(welcome.run for welcome in welcomes))
-            raise ActorError(f"several learners answer here ({names}): choose one with --run")
+        names = sorted({welcome.run for welcome in welcomes})
+        if len(names) > 1:
+            raise ActorError(f"several learners answer here ({', '.join(names)}): choose one with --run")
         if welcomes:
-            return welcomes[0]
+            return sorted(welcomes, key=lambda welcome: welcome.learner_epoch, reverse=True)
         _raise_if_over(answers)
         for refusal in answers:
             if isinstance(refusal, Refusal):
                 if refusal.code == "not_ready":  # the learner is stopping; another process may continue the run
-                    return None
+                    continue
                 kind = NameInUseError if refusal.code == "name_taken" else ActorRefusedError
                 raise kind(f"the learner refused this actor: {bounded_text(refusal.reason, MAX_ANSWER_TEXT)}")
-        return None
+        return []
 
     def report_failure(self, run: str, join: Join, error: Exception) -> None:
         """Report why this actor ends, for the status of the run. Does nothing if the learner itself is the cause."""
@@ -149,7 +168,8 @@ class LearnerQueries:
     def learner_responds(self, run: str, join: Join) -> bool:
         """Return whether any learner of `run` answers a request to join. Raises RunOverError if the answer says so."""
         answers = self._ask(keys.join(run, join.actor), encode(join))
-        _raise_if_over(answers)
+        if not any(isinstance(answer, Welcome) for answer in answers):
+            _raise_if_over(answers)
         return bool(answers)
 
     def program(self, run: str, name: str = "*") -> tuple[str, bytes] | None:
@@ -218,7 +238,30 @@ class LearnerQueries:
             answers = self._transport.query(key, payload, timeout=_ANSWER_SECONDS)
         except TransportError:
             return []
-        return [message for message in map(self.decode, answers) if message is not None]
+        messages, foreign = list[Message](), None
+        for answer in answers:
+            try:
+                message = self.decode(answer)
+            except ActorError as error:
+                foreign = error
+            else:
+                messages += [] if message is None else [message]
+        if foreign is not None and not messages:
+            raise foreign
+        if foreign is not None and str(foreign) != self._noted:
+            self._noted = str(foreign)
+            _logger.warning("ignored the answer of another learner: %s", foreign)
+        return messages
+
+
+def _log_several(welcomes: list[Welcome]) -> None:
+    newest = welcomes[0]
+    _logger.warning(
+        "%d learners of run %r answer: following the newest, epoch %x, once the older has stepped down",
+        len(welcomes),
+        newest.run,
+        newest.learner_epoch,
+    )
 
 
 def _raise_if_over(answers: list[Message]) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.epochs import starts_of
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import RunEnded
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
@@ -56,9 +57,10 @@ class RunEndWatch:
     def apply(self, message: RunEnded) -> None:
         """Obey a message. Raises RunOverError if the run finished.
 
-        The epoch of a finished run does not matter: a later learner may have finished it during a long rollout.
+        A later learner may have finished the run during a long rollout. An older one that was cut off, from which the
+        run was continued elsewhere, has not.
         """
-        if message.outcome == "finished":
+        if message.outcome == "finished" and starts_of(message.learner_epoch) >= starts_of(self.learner_epoch):
             raise RunOverError(f"the run is over: {bounded_text(message.reason, MAX_ANSWER_TEXT)}", finished=True)
         if message.learner_epoch == self.learner_epoch:
             self.learner_stopped = True

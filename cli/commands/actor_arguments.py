@@ -24,7 +24,8 @@ examples:
   daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
   daedalus actor --connect tcp/router:7447 --stay      (serves one run after another)
 
-exit status: 0 the run is over, the actor was stopped or an operator drained it; 1 failed; 2 bad usage"""
+exit status: 0 the run is over, the actor was stopped or an operator drained it; 1 failed; 2 bad usage. With --stay an
+actor ends by a signal, a drain, wrong arguments or its --timeout; after any other failure it tries again"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -53,7 +54,8 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--stay",
         action="store_true",
-        help="wait for the next run when a run is over, instead of ending. `daedalus drain` or a signal ends the actor",
+        help="wait for the next run when a run is over, and try again after a failure that others may remove, such as "
+        "a module that a run needs, instead of ending. `daedalus drain` or a signal ends the actor",
     )
     add_tls(options)
     add_logging(options)

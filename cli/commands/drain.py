@@ -5,18 +5,19 @@ import time
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser, seconds
 from daedalus.cli.logs import print_error, say
-from daedalus.cli.status_query import ask, no_answer
+from daedalus.cli.processes import status_at_start
+from daedalus.cli.status_query import ask, decoded, newest_of_each_run, no_answer
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
-from daedalus.protocol.messages import Refusal
+from daedalus.protocol.messages import Acknowledgement, Refusal
 from daedalus.protocol.status import RunStatus
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
-LEFT, FAILED, BAD_USAGE = 0, 1, 2
+LEFT, FAILED = 0, 1
 
 _DESCRIPTION = """\
 Asks actors to leave. Each actor ends with exit status 0 as soon as the learner has judged its current rollout, also if
@@ -58,7 +59,7 @@ def drain(arguments: list[str]) -> int:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except (ValueError, *SECURITY_ERRORS) as error:
         print_error("drain", error)
-        return BAD_USAGE
+        return status_at_start(error)
     try:
         transport = connect_until_interrupted(parsed.connect, credentials)
         try:
@@ -94,8 +95,11 @@ def drain_actors(transport: Transport, run: str, names: list[str], timeout: floa
 
 
 def _statuses_with(transport: Transport, run: str, name: str) -> list[RunStatus]:
-    """Return the statuses of the runs that an actor takes part in. Raises DrainError if there is none."""
-    statuses = ask(transport, run)
+    """Return the statuses of the runs that an actor takes part in: of each, that of its newest learner.
+
+    Raises DrainError if there is none.
+    """
+    statuses = newest_of_each_run(ask(transport, run))
     if not statuses:
         raise DrainError(no_answer(transport, run))
     found = [each for each in statuses if any(actor.actor == name and actor.alive for actor in each.actors)]
@@ -105,14 +109,13 @@ def _statuses_with(transport: Transport, run: str, name: str) -> list[RunStatus]
 
 
 def _request(transport: Transport, run: str, name: str) -> None:
-    """Ask the learner of a run to drain an actor. Raises DrainError if the learner does not accept the request."""
+    """Ask the learners of a run to drain an actor. Raises DrainError if none of them accepts the request."""
     answers = transport.query(keys.drain(run, name), timeout=_ANSWER_SECONDS)
     if not answers:
         raise DrainError(f"the learner of run {run!r} does not answer: run this command again")
-    for answer in answers:
-        message = decode(answer, ACKNOWLEDGEMENT_LIMITS)
-        if isinstance(message, Refusal):
-            raise DrainError(bounded_text(message.reason, MAX_ANSWER_TEXT))
+    if not decoded(answers, Acknowledgement, ACKNOWLEDGEMENT_LIMITS):
+        for refusal in decoded(answers, Refusal, ACKNOWLEDGEMENT_LIMITS):
+            raise DrainError(bounded_text(refusal.reason, MAX_ANSWER_TEXT))
     say(f"actor {name} leaves run {run!r} after its current rollout")
 
 

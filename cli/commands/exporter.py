@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.logs import add_logging, configure_logging, print_error
-from daedalus.cli.processes import stop_on_signals
+from daedalus.cli.processes import status_at_start, stop_on_signals
 from daedalus.cli.status_query import ask
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.retries import Retries
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.slow_calls import SlowCall
 
@@ -38,7 +39,7 @@ examples:
   daedalus exporter --connect tcp/127.0.0.1:7447         then: curl http://127.0.0.1:9464/metrics
   daedalus exporter --connect tcp/router:7447 --listen 0.0.0.0:9464
 
-exit status: 0 stopped by a signal, 1 the address is in use or the router rejects the certificate, 2 bad usage"""
+exit status: 0 stopped by a signal, 1 the address is in use or the certificate is not valid now, 2 bad usage"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -115,7 +116,7 @@ def exporter(arguments: list[str]) -> int:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except SECURITY_ERRORS as error:
         print_error("exporter", error)
-        return 2
+        return status_at_start(error)
     configure_logging(parsed.log_level, as_json=parsed.log_json, process="exporter")
     stop = stop_on_signals()
     collector, registry = StatusCollector(), CollectorRegistry()
@@ -131,9 +132,6 @@ def exporter(arguments: list[str]) -> int:
     _logger.info("serving http://%s:%d/metrics", host, server.server_port)
     try:
         _follow(collector, parsed.connect, credentials, stop)
-    except TransportError as error:  # retrying will not help
-        print_error("exporter", error)
-        return 1
     finally:
         server.shutdown()
         server.server_close()
@@ -144,15 +142,23 @@ def exporter(arguments: list[str]) -> int:
 def _follow(
     collector: StatusCollector, endpoints: list[str], credentials: Credentials | None, stop: threading.Event
 ) -> None:
-    """Keep the collector connected until a signal. Raises TransportError if the router rejects the certificate."""
+    """Keep the collector connected until a signal."""
 
     def check() -> None:
         if stop.is_set():
             raise TransportError("stopped")
 
-    transport = connect_with_retry(endpoints, stop, credentials=credentials)
-    if transport is None:
-        return
+    retries = Retries(stop)
+    while True:
+        try:
+            transport = connect_with_retry(endpoints, stop, credentials=credentials)
+        except TransportError as error:  # a certificate is refused, perhaps until somebody renews one
+            if retries.wait(str(error)):
+                return
+            continue
+        if transport is None:
+            return
+        break
     collector.transport = transport
     try:
         while not stop.wait(_REOPEN_SECONDS):

@@ -21,6 +21,7 @@ from daedalus.cli.gateway_packages import INSTALL
 from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.cli.other_runs import OtherRuns
 from daedalus.cli.processes import (
+    BAD_USAGE,
     exit_on_thread_exceptions,
     exit_status,
     exit_with_parent,
@@ -32,8 +33,9 @@ from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys
 from daedalus.transport.addresses import AddressError, check_listening
-from daedalus.transport.credentials import Credentials, load
+from daedalus.transport.credentials import Credentials, NotValidNowError, load
 from daedalus.transport.interface import TransportError
+from daedalus.transport.retries import Retries
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 LISTEN = "127.0.0.1:8080"
@@ -174,18 +176,24 @@ def main() -> int:
     """Run `daedalus gateway` and return its exit status."""
     arguments = parser().parse_args()
     configure_logging(arguments.log_level, as_json=arguments.log_json, process="gateway")
-    try:
-        if arguments.run != keys.ANY_RUN:
-            keys.check_name(arguments.run, "run")
-        chosen = _Chosen.of(arguments)
-        host, port = _listening_address(arguments.listen, chosen.serving is not None, arguments.insecure)
-    except (ValueError, OSError, *SECURITY_ERRORS) as error:
-        print_error("gateway", error)
-        return 2
     raise_descriptor_limit()
     stop = stop_on_signals(exit_if_stuck=True)
     if arguments.exit_with_parent:
         exit_with_parent(stop)
+    retries = Retries(stop)
+    while True:
+        try:
+            if arguments.run != keys.ANY_RUN:
+                keys.check_name(arguments.run, "run")
+            chosen = _Chosen.of(arguments)
+            host, port = _listening_address(arguments.listen, chosen.serving is not None, arguments.insecure)
+            break
+        except NotValidNowError as error:
+            if retries.wait(str(error)):
+                return 0
+        except (ValueError, OSError, *SECURITY_ERRORS) as error:
+            print_error("gateway", error)
+            return BAD_USAGE
     try:
         listener = _listen(host, port, arguments.or_any_port)
     except OSError as error:

@@ -2,10 +2,10 @@
 
 Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed, or the last checkpoint could not be
-saved; 2 bad usage. Under `daedalus train` a learner that a signal stopped exits with processes.STOPPED, and one that an
-operator stopped with processes.ORDERED. A supervised learner whose last checkpoint could not be saved exits with
-processes.UNSAVED. A learner of several processes that has lost one exits with processes.RANK_LOST, and is then started
-again.
+saved; 2 bad usage; 7 a newer learner of the run has taken over. Under `daedalus train` a learner that a signal stopped
+exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED. A supervised learner whose last
+checkpoint could not be saved exits with processes.UNSAVED. A learner of several processes that has lost one exits with
+processes.RANK_LOST, and is then started again.
 """
 
 import argparse
@@ -26,13 +26,17 @@ from daedalus.cli.learner_network import announce, learner_credentials, open_tra
 from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
+    BAD_USAGE,
+    FAILED,
     ORDERED,
     STOPPED,
+    SUPERSEDED,
     UNSAVED,
     exit_on_thread_exceptions,
     exit_status,
     exit_with_parent,
     raise_descriptor_limit,
+    status_at_start,
     stop_on_signals,
 )
 from daedalus.cli.quick_check import expected_defaults, expected_spaces
@@ -75,7 +79,7 @@ _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it r
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
-REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
+REACHED, NOT_REACHED = 0, 3
 _FAILURES = (
     AlgorithmError,
     CheckpointMismatchError,
@@ -121,7 +125,7 @@ def main() -> int:
         return BAD_USAGE
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print_error("learner", error)
-        return BAD_USAGE
+        return status_at_start(error)
     display = SilentProgress if arguments.no_progress else Progress
     progress = display(sys.stdout, run.spec.training.env_steps)
     context = {"run": run_directory.run_name(run.directory)}
@@ -176,6 +180,10 @@ class _Command:
             stack.enter_context(run_directory.made(run.directory))  # before a router is waited for, for status --alive
         Heartbeat(run.directory).clear()
         resumed = arguments.resume and run.exists
+        if resumed and (reason := run_directory.why_superseded(run.directory)):
+            print_error("learner", reason)
+            self.ranks.dismiss(run.spec, self.stop)
+            return SUPERSEDED
         finished = finished_run(run.directory, run.spec) if resumed else None
         if finished is not None:
             _logger.info("nothing to do: %s", finished.reason)
@@ -204,6 +212,8 @@ class _Command:
             if arguments.prepared is None:  # else the launcher starts them
                 _start_trackers(run.directory, arguments, self.progress, self.stop, stack)
             outcome = service.run()
+            if outcome.superseded_by is not None:
+                _note_superseded(run.directory, outcome.superseded_by)
         except _FAILURES:
             if not run.exists:
                 run_directory.remove_failed(run.directory)
@@ -298,11 +308,20 @@ def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
     return restored
 
 
+def _note_superseded(directory: Path, learner_epoch: int) -> None:
+    try:
+        run_directory.note_superseded(directory, learner_epoch)
+    except OSError as error:
+        _logger.error("%s cannot be written, so do not start this learner again: %s", directory, error.strerror)
+
+
 def _status(outcome: Outcome, spec: RunSpec, stopped: int, unsaved: int) -> int:
     """Return the exit status for the end of a run.
 
     `stopped` is that of a run that was stopped, and `unsaved` that of a run whose last checkpoint could not be saved.
     """
+    if outcome.superseded_by is not None:
+        return SUPERSEDED
     if not outcome.saved:
         return unsaved
     if not outcome.finished:

@@ -6,7 +6,7 @@ import math
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging, configure_logging, print_error
-from daedalus.cli.processes import raise_descriptor_limit, stop_on_signals
+from daedalus.cli.processes import raise_descriptor_limit, status_at_start, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN
 from daedalus.transport.addresses import check_connecting
 from daedalus.transport.connecting import listen
@@ -83,7 +83,7 @@ def router(arguments: list[str]) -> int:
         credentials = credentials_to_listen([parsed.listen], parsed.tls, "router", insecure=parsed.insecure)
     except SECURITY_ERRORS as error:
         print_error("router", error)
-        return 2
+        return status_at_start(error)
     raise_descriptor_limit()
     stop = stop_on_signals()
     try:

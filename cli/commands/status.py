@@ -7,6 +7,7 @@ from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.logs import print_error, say
+from daedalus.cli.processes import status_at_start
 from daedalus.cli.status_query import ask, ask_events, no_answer
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.status_watch import watch_status
@@ -22,7 +23,7 @@ from daedalus.transport.credentials import WARNING_DAYS, Credentials
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
-HEALTHY, NO_ANSWER, BAD_USAGE, UNHEALTHY = 0, 1, 2, 3
+HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
 
 _DESCRIPTION = """\
 Shows the state of the learners at an address and of their actors. The exit status serves as a health check: a learner
@@ -87,7 +88,7 @@ def status(arguments: list[str]) -> int:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except SECURITY_ERRORS as error:
         print_error("status", error)
-        return BAD_USAGE
+        return status_at_start(error)
     try:
         if parsed.watch:
             return _watch(parsed, credentials)

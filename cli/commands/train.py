@@ -20,7 +20,7 @@ from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
 from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
+from daedalus.cli.processes import exit_with_parent, process_started, status_at_start, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
 from daedalus.cli.run_report import report, show
 from daedalus.cli.running.local_run import (
@@ -80,7 +80,7 @@ examples:
   daedalus train cartpole --watch                (shows the run in a browser)
 
 exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
-before the target, 1 failed or stopped, 2 bad usage"""
+before the target, 1 failed or stopped, 2 bad usage, 7 a newer learner of the run has taken over"""
 
 _RESUME = """\
 Continues a run from its newest undamaged checkpoint, with the same weights, optimiser state, counters and random state.
@@ -128,7 +128,7 @@ def train(arguments: list[str]) -> int:
         return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
         print_error("train", error)
-        return 2
+        return status_at_start(error)
     with lock:
         return _run(lock, spec, parsed, started, screen, parsed.init_from, resume=False, spaces=spaces)
 
@@ -155,7 +155,7 @@ def resume(arguments: list[str]) -> int:
         return 1
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print_error("resume", error)
-        return 2
+        return status_at_start(error)
     with lock:
         finished = finished_run(parsed.directory, spec)
         if finished is not None and not finished.to_evaluate:

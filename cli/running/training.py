@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams
-from daedalus.cli.processes import ORDERED, UNSAVED
+from daedalus.cli.processes import ORDERED, SUPERSEDED, UNSAVED
 from daedalus.cli.running.child_arguments import (
     actor_arguments,
     evaluation_arguments,
@@ -104,7 +104,7 @@ def _supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams) 
         with open_streams("learner") as streams:
             return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
 
-    return Supervised("the learner", begin, ended=FINISHED | {ORDERED, UNSAVED})
+    return Supervised("the learner", begin, ended=FINISHED | {ORDERED, UNSAVED, SUPERSEDED})
 
 
 def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:

@@ -39,6 +39,7 @@ class _State(BaseModel, strict=True):
     returns: list[float]
     lengths: list[int]
     annealing: Annealing | None = None  # absent in checkpoints of earlier releases
+    starts: _Count = 0  # absent in checkpoints of earlier releases
 
 
 def check_counters(state: Any) -> dict[str, Any]:

@@ -39,6 +39,7 @@ OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
 CONFIRMATION = "confirmation.json"
 OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
 TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run
+_SUPERSEDED = "superseded_by"  # in summary.json: the epoch of the newer learner
 _PACKAGES = (
     "daedalus-rl",
     "torch",
@@ -211,6 +212,29 @@ def read_json(path: Path) -> dict[str, Any]:
     if content is None:
         raise SettingsError(f"{path} does not exist")
     return content
+
+
+def note_superseded(directory: Path, learner_epoch: int) -> None:
+    """Note in summary.json that a newer learner, in another copy of this directory, has taken over. Raises OSError.
+
+    No supervisor can tell a learner that must not return from one that failed. With this note it does not serve again.
+    """
+    try:
+        summary = read_json(directory / SUMMARY)
+    except SettingsError:
+        summary = {}
+    write_json(directory / SUMMARY, {**summary, _SUPERSEDED: f"{learner_epoch:x}"})
+
+
+def why_superseded(directory: Path) -> str:
+    """Return why the run must not be continued in this directory, and what to do; empty if it may."""
+    with suppress(SettingsError):
+        if newer := read_json(directory / SUMMARY).get(_SUPERSEDED):
+            return (
+                f"{directory}: a newer learner of this run (epoch {newer}) took over: the run goes on in "
+                f"the directory of that one. To continue this copy all the same, remove {directory / SUMMARY}"
+            )
+    return ""
 
 
 def _versions() -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """State of a run that the parts of a learner process share. No I/O."""
 
-import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.evaluations import Evaluations
 from daedalus.learner.run.health import Health
 from daedalus.learner.run.run_directory import run_name
+from daedalus.protocol.epochs import new_epoch
 from daedalus.protocol.spec import RunSpec
 
 
@@ -33,10 +33,19 @@ class RunState:
         spec: RunSpec,
         started: float,
         certificate_days_left: Callable[[], float | None] = lambda: None,
+        starts_before: int = 0,
     ) -> None:
-        """Begin a run. `started` is on the monotonic clock, in seconds; for the last argument see Health."""
+        """Begin a run, or continue it.
+
+        Args:
+          directory, spec: see RunState.
+          started: on the monotonic clock, in seconds.
+          certificate_days_left: see Health.
+          starts_before: learner processes that the run had before, from the checkpoint that it continues from.
+        """
         self.directory, self.name, self.spec, self._started = directory, run_name(directory), spec, started
-        self.learner_epoch = secrets.randbits(62)
+        self._starts = starts_before + 1
+        self.learner_epoch = new_epoch(self._starts)
         self.counters = RunCounters(spec.training.target_episodes)
         self.annealing = Annealing(budget=spec.training.env_steps)
         self.evaluations = Evaluations(self.learner_epoch, self.counters)
@@ -61,7 +70,8 @@ class RunState:
 
     def saved(self, now: float) -> dict[str, Any]:
         """Return the counters in the form that a checkpoint stores."""
-        return {**self.counters.state(self.wall_seconds(now)), "annealing": self.annealing.state()}
+        counters = self.counters.state(self.wall_seconds(now))
+        return {**counters, "annealing": self.annealing.state(), "starts": self._starts}
 
     def restore(self, saved: dict[str, Any], before: RunSpec) -> None:
         """Continue from a result of `saved`, perhaps with other settings than those of the run `before`."""

@@ -25,7 +25,7 @@ from daedalus.learner.serving.orders import Orders
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.requests import read_request
 from daedalus.learner.serving.rollout_intake import POLL_SECONDS, RolloutIntake
-from daedalus.learner.serving.session_watchdog import SessionWatchdog
+from daedalus.learner.serving.session_watchdog import LOOK, SessionWatchdog
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.learner.serving.status_responses import StatusResponses
 from daedalus.protocol import keys
@@ -82,7 +82,7 @@ class ActorServer:
           learner_epoch: epoch of this learner process.
           start_version: policy version of the checkpoint that the run continues from, else 0.
           spaces: spaces that all actors must have; None: those of the first actor.
-          orders: receives the orders of operators; None: nobody carries them out.
+          orders: receives the orders of operators, and notes a newer learner; None: nobody carries them out.
         """
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces, spec.training.epsilons)
@@ -102,7 +102,7 @@ class ActorServer:
             spec, self.lock, self.fleet, counters, lambda: self.publisher.version, self.events, **start
         )
         self.evaluations = EvaluationQueue()
-        self._watchdog = SessionWatchdog(transport, keys.status(run))
+        self._watchdog = SessionWatchdog(transport, keys.status(run), learner_epoch, self._step_down)
 
     def open(self) -> None:
         """Start to serve actors. Raises TransportError if another learner serves a run of this name."""
@@ -133,7 +133,8 @@ class ActorServer:
         """Serve a key; refuse queries above `limits` without a copy of their payload."""
 
         def handle(request: Request) -> None:
-            self._watchdog.heard()
+            if key != keys.status(self._run):  # `_on_status` tells a request from the watchdog's own
+                self._watchdog.heard()
             if limits is not None and request.size > limits.message_bytes:
                 reason = f"the message has {request.size:,} bytes, more than {limits.message_bytes:,}"
                 request.reply(encode(Refusal(code="malformed", reason=reason)))
@@ -167,6 +168,24 @@ class ActorServer:
         self.evaluations.end(reason, finished=finished)
         self._watchdog.close()
         self.rollouts.close()
+
+    def _step_down(self, newer: int) -> None:
+        """End this learner, because a newer one of the run answers. Called on the watchdog's thread.
+
+        The server is closed at once: an update may take long, and until then actors would stay here.
+        """
+        with self.lock:
+            if self._ended:
+                return
+        self._orders.step_down(newer)
+        self.close("a newer learner of this run has taken over")
+        _logger.warning(
+            "a newer learner of run %r answers (epoch %x; this one is %x): this learner steps down, and the run goes "
+            "on there. If that is another run, rename one of the two (the last part of --run-dir)",
+            self._run,
+            newer,
+            self._epoch,
+        )
 
     def _publish_end(self) -> None:
         with contextlib.suppress(TransportError):  # the session is being replaced; actors receive a repetition
@@ -249,4 +268,6 @@ class ActorServer:
         request.reply(encode(Acknowledgement(verdict="accepted")))
 
     def _on_status(self, request: Request) -> None:
+        if request.payload != LOOK:
+            self._watchdog.heard()
         request.reply(encode(self._status.answer(request)))

@@ -1,4 +1,4 @@
-"""Orders of operators. State; the transport's threads give them, and the learner's thread takes them."""
+"""Orders to the learner's thread, of operators and of a newer learner. State; other threads give them."""
 
 import threading
 
@@ -12,6 +12,7 @@ class Orders:
         """`stop` ends the run."""
         self._stop, self._save = stop, threading.Event()
         self.stopped = False  # whether an operator stopped the run
+        self.superseded_by: int | None = None  # epoch of a newer learner of the run, for which this one steps down
 
     def give(self, order: Order) -> None:
         """Note an order."""
@@ -20,6 +21,11 @@ class Orders:
         else:
             self.stopped = True
             self._stop.set()
+
+    def step_down(self, newer: int) -> None:
+        """Stop the run here: a learner of it with a newer epoch answers."""
+        self.superseded_by = newer
+        self._stop.set()
 
     def take_checkpoint(self) -> bool:
         """Return whether a checkpoint was ordered since the last call."""

@@ -107,16 +107,17 @@ class QueryResponses:
         return self._encoded_program
 
     def offer_snapshot(self, encoded: bytes, policy_version: int) -> None:
-        """Set the newest snapshot, as the bytes that were published."""
-        self._snapshot = encoded, policy_version
+        """Set the newest snapshot, as the bytes that were published. After `end` this has no effect."""
+        if self._ending is None:
+            self._snapshot = encoded, policy_version
 
     def end(self, run_ended: bytes, *, finished: bool) -> None:
         """Refuse later joins, and answer queries for snapshots with `run_ended`, an encoded RunEnded."""
-        self._snapshot = run_ended, None
         if finished:
             self._ending = Refusal(code="finished", reason="the run is over")
         else:
             self._ending = Refusal(code="not_ready", reason="the learner is stopping")
+        self._snapshot = run_ended, None
 
     def snapshot(self, held_version: int | None = None) -> bytes:
         """Return the answer to a query for the newest snapshot by an actor that holds `held_version`."""

@@ -1,5 +1,6 @@
 """ActorService against a scripted learner, over the memory transport: failures, refusals and the end of the run."""
 
+import contextlib
 import socket
 import struct
 import threading
@@ -11,9 +12,11 @@ from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknow
 
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session import learner_queries, runtime_maker, service, session_monitor
+from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
-from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, Welcome
+from daedalus.protocol.epochs import new_epoch
+from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome
 from daedalus.transport.interface import RefusedError, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -178,12 +181,77 @@ def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
 
 
+def test_actors_keep_to_the_newer_of_two_learners_of_one_run(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    older, newer = ScriptedLearner(network, epoch=new_epoch(1)), ScriptedLearner(network, epoch=new_epoch(2))
+    older.publish(0)
+    newer.publish(0, push=False)
+    actor = RunningActor(network)
+    until(lambda: any(line.startswith("2 learners of run 'r' answer") for line in LINES))
+    until(lambda: "waiting for the older learner to step down" in LINES)
+    assert older.rollouts.empty()
+    older.transport.close()
+    assert newer.receive()[0].identity.learner_epoch == newer.epoch
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def test_an_older_learner_that_does_not_step_down_is_not_waited_for(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learner_queries, "_STEP_DOWN_SECONDS", 0.05)
+    older, newer = ScriptedLearner(network, epoch=new_epoch(1)), ScriptedLearner(network, epoch=new_epoch(2))
+    transport = MemoryTransport(network)
+    end = RunEndWatch(transport, threading.Event())
+    join = Join(actor="a", incarnation=1)
+    welcome = learner_queries.LearnerQueries(transport).join_learner("*", join, None, end)
+    assert welcome.learner_epoch == newer.epoch
+    assert older.epoch < newer.epoch
+
+
+@pytest.mark.parametrize(("starts", "is_over"), [(1, False), (2, True), (3, True)])
+def test_only_an_older_learner_cannot_say_that_the_run_is_over(
+    network: MemoryNetwork, starts: int, is_over: bool
+) -> None:
+    """Two processes that resumed from the same checkpoint differ in random bits only: either may end the run."""
+    end = RunEndWatch(MemoryTransport(network), threading.Event())
+    end.follow("r", new_epoch(2))
+    finished = RunEnded(learner_epoch=new_epoch(starts), outcome="finished", reason="solved")
+    MemoryTransport(network).publish(keys.run_end("r"), encode(finished))
+    with pytest.raises(RunOverError) if is_over else contextlib.nullcontext():
+        end.check()
+
+
+@pytest.mark.parametrize("others", [0, 1])
+def test_an_answer_of_another_release_is_ignored_beside_one_of_ours(network: MemoryNetwork, others: int) -> None:
+    foreign = MemoryTransport(network)
+    foreign.serve(keys.join("three", "*"), lambda request: request.reply(of_another_release()))
+    learners = [ScriptedLearner(network, run="r") for _ in range(others)]
+    actor = RunningActor(network)
+    if not learners:
+        actor.join()
+        assert "protocol version" in str(actor.error)
+        return
+    learners[0].publish(0)
+    learners[0].receive()
+    assert any("ignored the answer of another learner: the other end uses protocol version" in text for text in LINES)
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def of_another_release() -> bytes:
+    newer = bytearray(encode(Refusal(code="not_ready", reason="")))
+    struct.pack_into("<H", newer, 4, PROTOCOL_VERSION + 1)
+    return bytes(newer)
+
+
 def test_actor_that_waits_for_another_run_names_the_runs_that_are_there(network: MemoryNetwork) -> None:
     learners = [ScriptedLearner(network, run=run) for run in ("two", "one")]
     of_another_version = MemoryTransport(network)
-    newer = bytearray(encode(Refusal(code="not_ready", reason="")))
-    struct.pack_into("<H", newer, 4, PROTOCOL_VERSION + 1)
-    of_another_version.serve(keys.join("three", "*"), lambda request: request.reply(bytes(newer)))
+    of_another_version.serve(keys.join("three", "*"), lambda request: request.reply(of_another_release()))
     actor = RunningActor(network, run="cartpol")
     until(lambda: "waiting for a learner of run 'cartpol'; the runs here are 'one', 'two'" in LINES)
     actor.stop.set()

@@ -93,3 +93,13 @@ def test_refusal_of_the_learner_is_reported(network: MemoryNetwork) -> None:
     learner.transport.serve(keys.drain("mine", "*"), lambda request: request.reply(refusal))
     with pytest.raises(drain.DrainError, match=r"^no actor 'box' takes part$"):
         drained(network)
+
+
+def test_of_two_learners_of_one_run_the_newer_decides(network: MemoryNetwork) -> None:
+    older, newer = Learner(network), Learner(network)
+    newer.epoch = EPOCH + 1
+    newer.serve_drain()
+    refusal = encode(Refusal(code="unknown", reason="no actor 'box' takes part"))
+    older.transport.serve(keys.drain("mine", "*"), lambda request: request.reply(refusal))
+    drained(network)
+    assert newer.drained == ["box"]

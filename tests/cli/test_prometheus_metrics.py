@@ -95,3 +95,9 @@ def test_label_values_from_the_network_are_escaped() -> None:
 
 def _info(environment: str) -> dict[str, str]:
     return {"run": "mine", "environment": environment, "algorithm": "impala"}
+
+
+def test_of_two_learners_of_one_run_the_newer_has_series() -> None:
+    samples = scraped(run_status(learner_epoch=2, updates=20), run_status(learner_epoch=1, updates=10))
+    assert value(samples, "daedalus_learners", run="mine") == 2.0
+    assert value(samples, "daedalus_updates_total", run="mine") == 20.0

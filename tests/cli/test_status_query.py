@@ -11,6 +11,7 @@ from statuses import actor_status, run_status
 
 from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
+from daedalus.cli.run_source import LearnerSource
 from daedalus.cli.status_query import ask, ask_events
 from daedalus.learner.reporting import report
 from daedalus.learner.run import heartbeat
@@ -18,7 +19,7 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.protocol import keys
-from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import (
     ActorsReport,
@@ -275,3 +276,35 @@ def test_address_and_alive_exclude_one_another(tmp_path: Path, capsys: pytest.Ca
         with pytest.raises(SystemExit):
             status_command(arguments)
     assert "--alive" in capsys.readouterr().err
+
+
+def test_of_two_learners_of_a_run_both_are_shown_and_the_newer_is_named(
+    operator: MemoryTransport, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A learner of another release, which nobody here can read, hides neither."""
+    newer = bytearray(encode(Refusal(code="unknown", reason="")))
+    newer[4] += 1  # the version
+    for answer in (
+        encode(StatusReport(status=run_status(learner_epoch=0x1F, actors=(actor_status("a"),)))),
+        bytes(newer),
+        encode(StatusReport(status=run_status(learner_epoch=0x2F, actors=(actor_status("a"),)))),
+    ):
+        learner = MemoryTransport(operator._network)
+        learner.serve(keys.status("mine"), lambda request, answer=answer: request.reply(answer))
+    shown = ask(operator)
+    assert [status.learner_epoch for status in shown] == [0x2F, 0x1F]
+    assert not shown[0].problems
+    problem = "the learner with epoch 1f is not the newest of this run: actors follow epoch 2f"
+    assert shown[1].problems[0].startswith(problem)
+    assert LearnerSource(operator).status(0).learner_epoch == 0x2F  # type: ignore[union-attr]
+    monkeypatch.setattr("daedalus.cli.commands.status.connect_until_interrupted", lambda *_: operator)
+    assert status_command(["--connect", "tcp/127.0.0.1:1", "--quiet"]) == 3
+    assert "mine: the learner with epoch 1f is not the newest" in capsys.readouterr().out
+
+
+def test_only_answers_of_another_release_are_an_error(operator: MemoryTransport) -> None:
+    newer = bytearray(encode(Refusal(code="unknown", reason="")))
+    newer[4] += 1
+    MemoryTransport(operator._network).serve(keys.status("mine"), lambda request: request.reply(bytes(newer)))
+    with pytest.raises(ProtocolError, match="protocol version"):
+        ask(operator)

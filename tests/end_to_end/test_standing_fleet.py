@@ -1,8 +1,14 @@
 """A standing fleet: an actor process that serves one run after another, until an operator drains it."""
 
+import json
+import os
+import shutil
+import signal
+import time
 from collections.abc import Callable
+from pathlib import Path
 
-from processes import Running
+from processes import Running, until
 
 Start = Callable[..., Running]
 
@@ -28,3 +34,38 @@ def test_an_actor_that_stays_serves_the_next_run_until_it_is_drained(start: Star
     assert actor.wait() == 0, actor.output
     actor.expect("an operator drained this actor")
     second.expect("actor standing is drained: it leaves after its current rollout")
+
+
+def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_actors(
+    start: Start, address: str, tmp_path: Path
+) -> None:
+    """The older learner is cut off from the router while the copy starts, and returns."""
+    start("router", "--listen", address).expect("listening")
+    learner = ("learner", "cartpole", "--connect", address, "--resume", "--run-dir")
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    often = (*endless, "--set", "service.checkpoint_seconds=0.2")
+    older = start(*learner, "one/sb", *often)
+    actors = [start("actor", "--connect", address, "--name", "leaves", "--envs", 4)]
+    actors.append(start("actor", "--connect", address, "--name", "stays", "--envs", 4, "--run", "sb", "--stay"))
+    older.expect("joined with 4 environments")
+    until(lambda: list((tmp_path / "one/sb/checkpoints").glob("0*")))
+    os.kill(older.process.pid, signal.SIGSTOP)
+    shutil.copytree(tmp_path / "one/sb", tmp_path / "two/sb", ignore=shutil.ignore_patterns(".*", "learner.lock"))
+    time.sleep(3.0)  # the router ends the connection of a silent peer after 2 s
+    newer = start(*learner, "two/sb", *often)
+    newer.expect("resuming from checkpoint")
+    newer.expect("actor=leaves: joined with")
+    newer.expect("actor=stays: joined with")
+    os.kill(older.process.pid, signal.SIGCONT)
+    assert older.wait() == 7, older.output
+    older.expect("a newer learner of run 'sb' answers .*: this learner steps down")
+    older.expect("stopped; checkpoint saved at")
+    for actor in actors:
+        assert actor.process.poll() is None, actor.output
+    status = start("status", "--connect", address, "--json")
+    status.wait()
+    (line,) = status.lines
+    assert json.loads(line)["actors_alive"] == 2
+    again = start(*learner, "one/sb", *often)  # as by a supervisor
+    assert again.wait() == 7
+    again.expect(r"one/sb: a newer learner of this run \(epoch [0-9a-f]+\) took over: .* remove one/sb/summary.json")

@@ -8,17 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 from building import ENVIRONMENTS, EPOCH, POLICY, RECURRENT, SPACES, identity, make_rollout, run_spec
+from log_lines import LINES
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving import held_answers
+from daedalus.learner.serving import held_answers, session_watchdog
 from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.orders import Orders
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ActorsReport,
     EvaluationReport,
     EvaluationRequest,
     Join,
@@ -29,9 +32,9 @@ from daedalus.protocol.messages import (
     SnapshotRequest,
 )
 from daedalus.protocol.spec import RunSpec, TrainingSpec
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.status import ActorsPage, RunStatus
 from daedalus.protocol.uploads import Rollout
-from daedalus.transport.interface import TransportError
+from daedalus.transport.interface import Request, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 REPORT = EvaluationReport(
@@ -493,3 +496,44 @@ def version_of(data: bytes | None) -> int:
     assert data is not None
     message = decode(data, Limits())
     return message.policy_version if isinstance(message, Snapshot) else -1
+
+
+@pytest.mark.parametrize("difference", [1, -1])
+def test_a_learner_steps_down_for_a_newer_one_of_its_run(
+    network: MemoryNetwork, difference: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_watchdog, "_LOOK_SECONDS", 0.02)
+    stop = threading.Event()
+    orders = Orders(stop)
+    transport, other, actor = MemoryTransport(network), MemoryTransport(network), MemoryTransport(network)
+    server = ActorServer(
+        "r", run_spec(), transport, RunCounters(10), no_status,
+        learner_epoch=EPOCH, start_version=0, spaces=SPACES, orders=orders,
+    )  # fmt: skip
+    server.open()
+    ends = actor.subscribe(keys.run_end("r"), lambda: None)
+    page = ActorsPage(learner_epoch=EPOCH + difference, actors=())
+    looked = threading.Semaphore(0)
+
+    def answer(request: Request) -> None:
+        request.reply(encode(ActorsReport(page=page)))
+        looked.release()
+
+    other.serve(keys.status("r"), answer)
+    if difference > 0:
+        assert stop.wait(LIMIT)
+        assert orders.superseded_by == EPOCH + 1
+        until(lambda: any("this learner steps down, and the run goes on there" in line for line in LINES))
+        ended = decode(ends.take() or b"", Limits())
+        assert isinstance(ended, RunEnded)
+        assert (ended.outcome, ended.learner_epoch) == ("stopped", EPOCH)
+        join = encode(Join(actor="a", incarnation=1))
+        refusal = decode(actor.query(keys.join("r", "a"), join, timeout=LIMIT)[0], Limits())
+        assert isinstance(refusal, Refusal)
+        assert refusal.code == "not_ready"
+    else:
+        for _ in range(3):
+            assert looked.acquire(timeout=LIMIT)
+        assert not stop.is_set()
+        assert sum("it is older than this one and steps down" in line for line in LINES) == 1
+    server.close("the test is over")

@@ -8,11 +8,13 @@ import pytest
 from building import POLICY, SPACES, make_rollouts, run_spec
 
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.counters import check_counters
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpointer import Checkpointer
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.saved_policy import read_policy
+from daedalus.protocol.epochs import new_epoch
 from daedalus.protocol.spec import TrainingSpec
 
 
@@ -66,3 +68,14 @@ def test_a_run_whose_directory_was_removed_can_be_resumed(tmp_path: Path) -> Non
     assert any("was moved or removed: the run continues in a new one" in text for text in texts)
     checkpointer.save()
     assert sum("moved or removed" in event.text for event in events.report()) == 1
+
+
+def test_a_learner_that_resumes_is_newer_than_every_learner_before_its_checkpoint(tmp_path: Path) -> None:
+    first = RunState(tmp_path, run_spec(), started=0.0)
+    saved = check_counters(first.saved(now=1.0))
+    copies = [RunState(tmp_path, run_spec(), 0.0, starts_before=saved["starts"]) for _ in range(20)]
+    assert all(first.learner_epoch < copy.learner_epoch < 2**62 for copy in copies)
+    assert len({copy.learner_epoch for copy in copies}) == len(copies)
+    after = RunState(tmp_path, run_spec(), 0.0, starts_before=check_counters(copies[0].saved(now=1.0))["starts"])
+    assert after.learner_epoch > max(copy.learner_epoch for copy in copies)
+    assert new_epoch(10**9) < 2**62

@@ -12,6 +12,7 @@ from certificates import issue_expired, make_certificates, unchecked
 from processes import free_address
 
 from daedalus.cli.commands.certs import certs
+from daedalus.learner.serving.session_watchdog import LOOK
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CredentialsError, load, with_remedy
 from daedalus.transport.interface import AddressInUseError, RefusedError, Transport, TransportError
@@ -157,6 +158,14 @@ def answers_joins(scene: Scene) -> bool:
     return scene.actor.query(keys.join("fake", "box"), timeout=scene.patience) == [b"come to me"]
 
 
+def answers_status(scene: Scene) -> bool:
+    """As a newer learner would: the learner of the run steps down for it."""
+    scene.own.serve(keys.status("fake"), lambda request: request.reply(b"I am newer"))
+    scene.own.serve("daedalus/*/status", lambda request: request.reply(b"I am newer"))
+    scene.own.query(keys.join("r", scene.name), timeout=scene.patience)
+    return b"I am newer" in scene.learner.query(keys.status("fake"), LOOK, timeout=scene.patience)
+
+
 def watches_presence(scene: Scene) -> bool:
     seen: list[str] = []
     sure: list[str] = []
@@ -192,6 +201,7 @@ OPERATIONS = (
     reads_publications,
     publishes,
     answers_joins,
+    answers_status,
     watches_presence,
     reads_the_status,
     drains,
