@@ -54,7 +54,7 @@ def test_the_script_is_valid_bash(script: Path) -> None:
     [
         ("daedalus tra", {"train"}),
         ("daedalus e", {"evaluate", "exporter"}),
-        ("daedalus train --al", {"--algorithm"}),
+        ("daedalus train --alg", {"--algorithm"}),
         ("daedalus train --algorithm im", {"impala"}),
         ("daedalus train cartp", {name for name in preset_names() if name.startswith("cartp")}),
         ("daedalus learner pon", {"pong"}),
