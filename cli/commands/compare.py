@@ -16,7 +16,9 @@ _DESCRIPTION = """\
 Compares finished runs of one environment. Runs with equal settings apart from the seed are one group, which is named
 after the settings in which they differ; or you name the groups, with `--` between them. The table shows the final
 return, env_steps and minutes until the mean return of the training episodes reached a threshold, and the probability
-that a run is better than one of the first group. A folder of run directories stands for all of them."""
+that a run is better than one of the first group. Where training plays another task than evaluations
+(environment.training_kwargs, environment.no_reward_limit), evaluations have to reach the threshold. A folder of run
+directories stands for all of them."""
 
 _EXAMPLES = """\
 examples:

@@ -54,11 +54,10 @@ def test_the_script_is_valid_bash(script: Path) -> None:
     [
         ("daedalus tra", {"train"}),
         ("daedalus e", {"evaluate", "exporter"}),
-        ("daedalus train --al", {"--algorithm"}),
+        ("daedalus train --alg", {"--algorithm"}),
         ("daedalus train --algorithm im", {"impala"}),
         ("daedalus train cartp", {name for name in preset_names() if name.startswith("cartp")}),
         ("daedalus learner pon", {"pong"}),
-        ("daedalus train --alg", {"--algorithm"}),
         ("daedalus train cartpole --see", {"--seed"}),
         ("daedalus certs is", {"issue"}),
         ("daedalus certs issue ac", {"actor"}),
