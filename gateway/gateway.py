@@ -249,14 +249,14 @@ class Gateway:
             if not seat.is_joining:
                 self._start(self._joining.rejoin(seat))
 
-    def _on_run_over(self, reason: str) -> None:
+    def _on_run_over(self, end: ClientError | str) -> None:
         self._versions.clear()
-        self.run.end(reason)
+        self.run.end(end if isinstance(end, str) else "")
         self._parked.clear()
         self._newest_version = -1
         for seat in list(self._seats.values()):
             self._batcher.remove(seat.actor)
-            seat.on_end(reason)
+            seat.on_end(end)
 
     def _on_policy(self, version: PolicyVersion) -> None:
         self._versions.offer(version)
@@ -283,3 +283,7 @@ class Gateway:
     def on_run_over(self, reason: str) -> None:
         """See LinkEvents."""
         self._post(self._on_run_over, reason)
+
+    def on_failure(self, reason: str) -> None:
+        """See LinkEvents."""
+        self._post(self._on_run_over, ClientError("unavailable", reason))

@@ -50,7 +50,11 @@ class LinkEvents(Protocol):
         ...
 
     def on_run_over(self, reason: str) -> None:
-        """The run has ended, or this gateway cannot take part in it; another learner is looked for."""
+        """The run has ended; another is looked for."""
+        ...
+
+    def on_failure(self, reason: str) -> None:
+        """The gateway cannot take part in the run now; it tries again."""
         ...
 
 
@@ -116,7 +120,7 @@ class LearnerLink:
             except (ActorError, PolicyError, TransportError) as error:
                 self.queries.report_failure(self._end.run, self._join, error)
                 if self._follows:
-                    self._events.on_run_over(str(error))
+                    self._events.on_failure(str(error))
                 retries.wait(str(error))
             finally:
                 self._follows = False

@@ -31,6 +31,8 @@ def main() -> int:
         "learners": lambda: learners.kills(scaled(50)),
         "ends": lambda: endings.run_ends(scaled(100)),
         "restarts": lambda: endings.restarts(scaled(100)),
+        "splits": lambda: learners.splits(scaled(6)),
+        "standing": lambda: endings.standing(scaled(6)),
         "stops": lambda: learners.stops(scaled(8)),
         "routers": lambda: network.routers(scaled(20)),
         "cuts": lambda: network.cuts(30.0 if arguments.scale >= 1.0 else 8.0, scaled(2)),

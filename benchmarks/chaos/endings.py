@@ -4,13 +4,24 @@ import itertools
 import signal
 import sys
 import time
+from collections.abc import Callable
+from contextlib import closing
 
 from processes import Running
 
 from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scene, seconds
 from benchmarks.slow_actors import MODULE, provide_environment
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Refusal, Welcome
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.transport.zenoh_transport import connect
 
 _EACH = 10  # actors in a run
+_ENVIRONMENT = """import gymnasium
+
+gymnasium.register("Theirs-v0", entry_point="gymnasium.envs.classic_control:CartPoleEnv")
+"""
 _ROWS, _ENVIRONMENTS = 8, 2
 _CASES = tuple(itertools.product((4, 500), ("direct", "router", "direct, --link wan")))  # milliseconds a step, path
 
@@ -42,6 +53,78 @@ def run_ends(count: int) -> list[tuple[str, str]]:
         ),
         ("the last actor left after the learner by", seconds(slowest)),
     ]
+
+
+def standing(count: int) -> list[tuple[str, str]]:
+    """Disturb a standing fleet by what others start on its router; it must serve the next run that it can play."""
+    joined, names = [], [f"standing-{number}" for number in range(4)]
+    kinds = (_foreign_release, _unplayable_run, _two_runs)
+    with scene() as here:
+        here.router()
+        fleet = [
+            here.start("actor", "--connect", here.address, "--name", name, "--envs", 4, "--stay") for name in names
+        ]
+        for number, disturb in zip(range(count), itertools.cycle(kinds), strict=False):
+            seen = [len(actor.lines) for actor in fleet]
+            disturb(here, number, lambda fleet=fleet, seen=seen: _refused_since(fleet, seen))
+            began = time.monotonic()
+            run = here.start("learner", "cartpole", "--connect", here.address, "--run-dir", f"ours-{number}", *ENDLESS)
+            here.wait("all actors", lambda: (status := here.status()) and status.actors_alive == len(names))
+            joined.append(time.monotonic() - began)
+            if any(actor.process.poll() is not None for actor in fleet):
+                raise FailedError("\n".join(actor.output[-1000:] for actor in fleet))
+            run.process.send_signal(signal.SIGTERM)
+            run.wait()
+            for actor in fleet:  # forget the run, to which an actor that has joined keeps
+                actor.process.terminate()
+                actor.wait()
+            fleet = [
+                here.start("actor", "--connect", here.address, "--name", name, "--envs", 4, "--stay") for name in names
+            ]
+            say(f"disturbance {number + 1} of {count} ({disturb.__name__[1:]}): joined after {joined[-1]:.2f} s")
+    return [
+        (
+            "a learner of another release, a run without its module here, two runs",
+            f"{count} disturbances: 0 of {len(names)} standing actors ended",
+        ),
+        ("all of them took part in the next run after", seconds(joined)),
+    ]
+
+
+def _refused_since(fleet: list[Running], seen: list[int]) -> bool:
+    """Return whether each actor has logged since that it tries again."""
+    return all(
+        any("trying again" in line for line in actor.lines[first:]) for actor, first in zip(fleet, seen, strict=True)
+    )
+
+
+def _foreign_release(here: Scene, number: int, refused: Callable[[], bool]) -> None:
+    answer = bytearray(encode(Refusal(code="not_ready", reason="")))
+    answer[4] += 1  # the version
+    with closing(connect([here.address])) as foreign:
+        foreign.serve(keys.join(f"foreign-{number}", "*"), lambda request: request.reply(bytes(answer)))
+        here.wait("refusals", refused)
+
+
+def _unplayable_run(here: Scene, number: int, refused: Callable[[], bool]) -> None:
+    (here.folder / "theirs.py").write_text(_ENVIRONMENT)
+    options = ("--env", "theirs:Theirs-v0", "--connect", here.address, "--run-dir", f"theirs-{number}")
+    theirs = here.start("learner", *options)
+    here.wait("refusals", refused)
+    theirs.end()
+
+
+def _two_runs(here: Scene, number: int, refused: Callable[[], bool]) -> None:
+    answer = [
+        encode(
+            Welcome(run=f"{name}-{number}", learner_epoch=1, seed=1, spec=RunSpec(environment=EnvironmentSpec(id="x")))
+        )
+        for name in ("one", "two")
+    ]
+    with closing(connect([here.address])) as first, closing(connect([here.address])) as second:
+        for transport, name, welcome in zip((first, second), ("one", "two"), answer, strict=True):
+            transport.serve(keys.join(f"{name}-{number}", "*"), lambda request, welcome=welcome: request.reply(welcome))
+        here.wait("refusals", refused)
 
 
 def restarts(count: int) -> list[tuple[str, str]]:

@@ -88,6 +88,50 @@ def _await_stage(checkpoints: Path, choose: random.Random) -> str:
     raise FailedError("no checkpoint was being saved")
 
 
+def splits(count: int) -> list[tuple[str, str]]:
+    """Cut a learner off, continue its run from a copy elsewhere, and heal the cut: the actors keep to the newer one.
+
+    A frozen process stands for the cut: the router ends its connection, and it comes back with its old state.
+    """
+    healed, trained, names = [], [], [f"actor-{number}" for number in range(4)]
+    command = ("learner", "cartpole", "--resume", "--set", "service.checkpoint_seconds=0.5", *ENDLESS, "--run-dir")
+    with scene() as here:
+        here.router()
+        older = here.start(*command, "copy-0/sb", "--connect", here.address)
+        stay = ("--run", "sb", "--stay")
+        actors = [
+            here.start("actor", "--connect", here.address, "--name", name, "--envs", 4, *(stay if number % 2 else ()))
+            for number, name in enumerate(names)
+        ]
+        for number in range(count):
+            here.wait_for_training(*names)
+            source, copy = (here.folder / f"copy-{each}/sb" for each in (number, number + 1))
+            here.wait("a checkpoint", lambda source=source: _durable(source / "checkpoints") > -1)
+            older.process.send_signal(signal.SIGSTOP)
+            shutil.copytree(source, copy, ignore=shutil.ignore_patterns(".*", "learner.lock"))
+            here.wait("the end of the connection", lambda: here.status() is None)
+            newer = here.start(*command, copy, "--connect", here.address)
+            here.wait("all actors", lambda: (status := here.status()) and status.actors_alive == len(names))
+            began = time.monotonic()
+            older.process.send_signal(signal.SIGCONT)
+            if older.wait() != 7 or "checkpoint saved at" not in older.output:
+                raise FailedError(f"the older learner did not step down:\n{older.output}")
+            healed.append(time.monotonic() - began)
+            for name in names:
+                here.wait_for_training(name)
+            trained.append(time.monotonic() - began)
+            ended = [name for name, actor in zip(names, actors, strict=True) if actor.process.poll() is not None]
+            if ended or newer.process.poll() is not None:
+                raise FailedError(f"ended: {ended}\n{newer.output}")
+            say(f"split {number + 1} of {count}: stepped down after {healed[-1]:.2f} s")
+            older = newer
+    return [
+        ("cuts that healed, with the run continued from a copy", f"{count}: no actor of {len(names)} ended"),
+        ("the older learner had saved its checkpoint and ended with 7 after", seconds(healed)),
+        ("all actors were trained on again after", seconds(trained)),
+    ]
+
+
 def stops(count: int) -> list[tuple[str, str]]:
     """Stop `daedalus train` with one or two signals while an actor is frozen."""
     taken, saved = [], 0

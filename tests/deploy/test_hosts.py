@@ -11,6 +11,9 @@ import pytest
 from certificates import make_certificates
 from commands import check
 
+from daedalus.cli.commands.learner import NOT_REACHED
+from daedalus.cli.processes import BAD_USAGE, SUPERSEDED
+
 ROOT = Path(__file__).parents[2]
 SYSTEMD = ROOT / "deploy" / "systemd"
 UNIT, ACTOR_UNIT = SYSTEMD / "daedalus@.service", SYSTEMD / "daedalus-actor@.service"
@@ -39,9 +42,12 @@ def test_the_example_arguments_of_the_systemd_units_are_valid(path: Path, roles:
 
 def test_the_systemd_units_restart_what_has_not_finished() -> None:
     service, actor = unit(UNIT)["Service"], unit(ACTOR_UNIT)["Service"]
-    assert (service["Restart"], actor["Restart"]) == ("on-failure", "always")
-    assert service["SuccessExitStatus"] == "3"  # the budget was used up
-    own = {"Restart", "SuccessExitStatus", "TimeoutStopSec", "Environment"}
+    assert (service["Restart"], actor["Restart"]) == ("on-failure", "on-failure")
+    assert service["SuccessExitStatus"] == str(NOT_REACHED)  # the budget was used up
+    assert service["RestartPreventExitStatus"] == f"{BAD_USAGE} {SUPERSEDED}"
+    assert actor["RestartPreventExitStatus"] == str(BAD_USAGE)
+    assert actor["ExecStart"] == f"{service['ExecStart']} --stay"  # a drained actor, which ends with 0, stays away
+    own = {"ExecStart", "RestartPreventExitStatus", "SuccessExitStatus", "TimeoutStopSec", "Environment"}
     assert {name: value for name, value in service.items() if name not in own} == {
         name: value for name, value in actor.items() if name not in own
     }
@@ -49,7 +55,7 @@ def test_the_systemd_units_restart_what_has_not_finished() -> None:
 
 def test_the_tls_drop_in_passes_the_files_that_an_actor_needs(tmp_path: Path) -> None:
     text = (SYSTEMD / "tls.conf").read_text()
-    command = f"{unit(UNIT)['Service']['ExecStart']} --tls %d"
+    command = f"{unit(ACTOR_UNIT)['Service']['ExecStart']} --tls %d"
     assert re.findall(r"^ExecStart=(.*)$", text, re.MULTILINE) == ["", command]  # empty: replaces that of the unit
     loaded = dict(re.findall(r"^LoadCredential=(.*):/etc/daedalus/tls/%i/(.*)$", text, re.MULTILINE))
     issued = make_certificates(tmp_path / "certs") / "actor-arm"

@@ -17,6 +17,8 @@ from certificates import make_certificates
 from commands import check
 from processes import LIMIT, until
 
+from daedalus.cli.commands.learner import NOT_REACHED
+from daedalus.cli.processes import BAD_USAGE, SUPERSEDED
 from daedalus.protocol.keys import owner
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "kubernetes"
@@ -173,7 +175,9 @@ def test_the_probes_check_the_run_of_the_learner() -> None:
 
 
 # The learner of the manifest is replaced by a program that ends with the given status, or waits for a signal.
-@pytest.mark.parametrize(("learner", "status"), [("exit 0", 0), ("exit 3", 3), ("kill -9 $$", 137), ("", 143)])
+@pytest.mark.parametrize(
+    ("learner", "status"), [("exit 0", 0), ("exit 3", 3), ("exit 7", 7), ("kill -9 $$", 137), ("", 143)]
+)
 def test_the_job_distinguishes_a_run_that_ended_from_one_that_was_stopped(
     tmp_path: Path, learner: str, status: int
 ) -> None:
@@ -190,7 +194,7 @@ def test_the_job_distinguishes_a_run_that_ended_from_one_that_was_stopped(
         assert process.wait(LIMIT) == status
     assert (tmp_path / "saved").exists() == (not learner)
     rules = ALL["Job/learner"]["spec"]["podFailurePolicy"]["rules"]
-    assert rules[0]["onExitCodes"]["values"] == [2, 3]
+    assert rules[0]["onExitCodes"]["values"] == [BAD_USAGE, NOT_REACHED, SUPERSEDED]
 
 
 def test_images_are_named_by_the_kustomization_and_built_by_the_dockerfile() -> None:

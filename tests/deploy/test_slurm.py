@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ echo "$*" >> calls
 case $1 in
 certs) stat -c %a .daedalus-* >> modes ;;
 router) until [ -e end-router ]; do sleep 0.05; done; exit 1 ;;
+actor) until [ -e end-actors ]; do sleep 0.05; done; exit 1 ;;
 learner)
     trap 'echo TERM >> signals; exit 0' TERM
     touch learner-runs
@@ -37,7 +39,8 @@ esac
 def job(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     programs = tmp_path / "bin"
     programs.mkdir()
-    for name, text in (("daedalus", DAEDALUS), ("srun", '#!/bin/bash\nshift\nexec "$@"\n')):
+    sleep = f"#!/bin/bash\nexec {shutil.which('sleep')} 0.05\n"  # a minute of the script takes 3 s
+    for name, text in (("daedalus", DAEDALUS), ("srun", '#!/bin/bash\nshift\nexec "$@"\n'), ("sleep", sleep)):
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
     environment = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}", "SLURM_JOB_ID": "12345"}
@@ -94,3 +97,18 @@ def test_the_job_fails_if_the_router_fails(job: subprocess.Popen[bytes], tmp_pat
     assert job.wait(LIMIT) == 1
     assert (tmp_path / "errors").read_text() == "the router failed: the job ends\n"
     assert (tmp_path / "signals").read_text() == "TERM\n"
+
+
+def test_the_job_ends_if_all_actors_have_failed(job: subprocess.Popen[bytes], tmp_path: Path) -> None:
+    """The learner would wait for an actor until the time of the job is over."""
+    (tmp_path / "end-actors").touch()
+    assert job.wait(LIMIT) == 1
+    assert (tmp_path / "errors").read_text() == "all actors have ended: the job ends\n"
+    assert (tmp_path / "signals").read_text() == "TERM\n"
+
+
+def test_actors_that_leave_a_run_that_is_over_do_not_fail_the_job(job: subprocess.Popen[bytes], tmp_path: Path) -> None:
+    (tmp_path / "end-actors").touch()
+    until(lambda: "actor" in (tmp_path / "calls").read_text())
+    (tmp_path / "end-learner").touch()
+    assert job.wait(LIMIT) == 3

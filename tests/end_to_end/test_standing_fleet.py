@@ -6,9 +6,15 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from processes import Running, until
+
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Refusal
+from daedalus.transport.zenoh_transport import connect, listen
 
 Start = Callable[..., Running]
 
@@ -69,3 +75,28 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
     again = start(*learner, "one/sb", *often)  # as by a supervisor
     assert again.wait() == 7
     again.expect(r"one/sb: a newer learner of this run \(epoch [0-9a-f]+\) took over: .* remove one/sb/summary.json")
+
+
+def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release(
+    start: Start, address: str, tmp_path: Path
+) -> None:
+    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
+    router = listen([address])
+    try:
+        actor = start("actor", "--connect", address, "--name", "standing", "--envs", 4, "--stay")
+        newer = bytearray(encode(Refusal(code="not_ready", reason="")))
+        newer[4] += 1  # the version
+        with closing(connect([address])) as foreign:
+            foreign.serve(keys.join("foreign", "*"), lambda request: request.reply(bytes(newer)))
+            actor.expect("the other end uses protocol version .*; trying again")
+        first = start("learner", "--env", "slow_environment:Slow-v0", "--connect", address, "--run-dir", "theirs")
+        actor.expect("slow_environment.*; trying again")
+        first.expect("failed .*slow_environment")
+        first.end()
+        second = start("learner", "cartpole", "--connect", address, "--run-dir", "ours", "--env-steps", 3000)
+        actor.expect("joined run 'ours'")
+        assert second.wait() == 3, second.output
+        actor.expect("waiting for the next run")
+        assert actor.process.poll() is None
+    finally:
+        router.close()

@@ -10,6 +10,7 @@ import msgpack
 import numpy as np
 import pytest
 from gateways import CARTPOLE, JsonClient, RunningGateway
+from log_lines import LINES
 from processes import LIMIT, until
 from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
@@ -20,13 +21,14 @@ from daedalus.gateway import gateway as gateway_module
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.messages import Act
-from daedalus.policy.acting.runtime import Choice, OnnxRuntime
+from daedalus.policy.acting.runtime import Choice, OnnxRuntime, PolicyError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.transport import retries
 from daedalus.transport.interface import Declaration, TransportError
-from daedalus.transport.memory import MemoryNetwork
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 Connect = Callable[..., JsonClient]
 ROWS = 4
@@ -661,3 +663,46 @@ def test_client_that_returns_while_the_gateway_stops_is_refused(
     running.close()
     client.close()
     returned.close()
+
+
+@pytest.fixture
+def quick_retries(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retries, "_FIRST_PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr(retries, "_MAX_PAUSE_SECONDS", 0.01)
+
+
+@pytest.mark.usefixtures("quick_retries")
+def test_a_gateway_outlives_a_second_run_and_another_release(network: MemoryNetwork, connect: Connect) -> None:
+    foreign = MemoryTransport(network)
+    newer = bytearray(encode(Refusal(code="not_ready", reason="")))
+    newer[4] += 1
+    foreign.serve(keys.join("three", "*"), lambda request: request.reply(bytes(newer)))
+    until(lambda: any(line.startswith("the other end uses protocol version") for line in LINES))
+    first, second = ScriptedLearner(network, run="one"), ScriptedLearner(network, run="two")
+    until(lambda: any(line.startswith("several learners answer here (one, two)") for line in LINES))
+    first.transport.close()
+    foreign.close()
+    second.publish(0)
+    assert connect().hello("arm-1")["run"] == "two"
+
+
+@pytest.mark.usefixtures("quick_retries")
+def test_a_policy_that_does_not_run_ends_its_clients_and_not_the_gateway(
+    learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = connect()
+    client.hello("arm-1")
+    act = OnnxRuntime.act
+
+    def fail(*_: object) -> None:
+        raise PolicyError("the policy takes longer than 30 s")
+
+    monkeypatch.setattr(OnnxRuntime, "act", fail)
+    client.send("act", observation=[0.0, 0.0, 0.0, 0.0])
+    answer = client.receive()
+    assert (answer["type"], answer["code"]) == ("error", "unavailable")
+    until(lambda: any(join.failure == "the policy takes longer than 30 s" for join in list(learner.joins.queue)))
+    monkeypatch.setattr(OnnxRuntime, "act", act)
+    again = connect()
+    again.hello("arm-1")
+    assert "action" in again.act([0.0, 0.0, 0.0, 0.0])

@@ -12,6 +12,7 @@ from certificates import issue_expired, make_certificates, unchecked
 from processes import free_address
 
 from daedalus.cli.commands.certs import certs
+from daedalus.cli.commands.router import router
 from daedalus.learner.serving.session_watchdog import LOOK
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CredentialsError, load, with_remedy
@@ -373,3 +374,13 @@ def test_listener_without_authorised_clients_does_not_start(tmp_path: Path, text
     (folder / "clients.pem").write_text(text)
     with pytest.raises(CredentialsError, match=r"no readable clients\.pem"):
         listen(["tls/127.0.0.1:0"], credentials=load(folder, "learner"))
+
+
+def test_a_certificate_that_is_not_valid_now_is_no_bad_usage(
+    certificates: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever supervises the process must start it again: the certificate may be renewed."""
+    expired = issue_expired(certificates, "router")
+    assert router(["--listen", "tls/127.0.0.1:1", "--tls", str(expired)]) == 1
+    assert "expired on" in capsys.readouterr().err
+    assert router(["--listen", "tls/127.0.0.1:1", "--tls", str(certificates)]) == 2
