@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from daedalus.learner.reporting.metrics import COLUMNS, Details
+from daedalus.policy.saving.regular_files import append_own
 from daedalus.policy.saving.replacing import replacing
 
 _BLOCK_BYTES = 1 << 16
@@ -26,7 +27,7 @@ class CsvWriter:
         self._path = path
         _remove_partial_line(path)
         self._columns = _header(path)  # another release may have had other columns
-        self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+        self._file = append_own(path)
         if not self._columns:
             self._append(COLUMNS)
             self._columns = COLUMNS
