@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Self
 
+from daedalus.policy.saving.regular_files import append_own
+
 STREAMS = ("stdout", "stderr")
 
 _LONGEST_LINE = 1 << 16  # bytes; a longer line is split
@@ -71,7 +73,7 @@ class OutputLog:
         """Append lines."""
         with suppress(OSError):
             if self._file is None:
-                self._file = open(self._path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+                self._file = append_own(self._path)
                 self._bytes = self._file.tell()
             data = b"".join(lines)
             self._file.write(data)

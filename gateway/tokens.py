@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.gateway.errors import ClientError
+from daedalus.policy.saving.regular_files import read_regular
 
 # In the folder of a gateway: {NAME: {"sha256": HEX, "expires": SECONDS_SINCE_1970}}; of an operator OPERATOR + NAME.
 TOKENS = "tokens.json"
@@ -123,8 +124,7 @@ class OperatorToken:
                 file.write(new_token() + "\n")
         except FileExistsError:
             pass
-        with open(path, encoding="ascii") as file:
-            token = file.read(_MAX_TOKEN + 1).strip()
+        token = read_regular(path, _MAX_TOKEN + 1).decode("ascii").strip()
         if not _MIN_TOKEN <= len(token) <= _MAX_TOKEN:
             raise ValueError(f"{path} has no token of {_MIN_TOKEN} to {_MAX_TOKEN} characters: delete the file")
         self._digest = digest(token)

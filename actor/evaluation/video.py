@@ -66,7 +66,8 @@ class Video:
         if self._path.is_dir():
             raise VideoError(f"cannot write {self._path}: it is a directory")
         try:
-            self._partial.touch()
+            self._partial.unlink(missing_ok=True)  # it may be a link of somebody else
+            self._partial.touch(exist_ok=False)
         except OSError as error:
             raise self._write_error(error) from None
         return self

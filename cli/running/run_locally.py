@@ -1,6 +1,7 @@
 """Function `run_locally`: training, then the evaluation of the result. What went wrong becomes one of three errors."""
 
 import threading
+from contextlib import suppress
 from typing import Any
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
@@ -61,6 +62,9 @@ def run_locally(
     finally:
         stop([gateway.process for gateway in page])  # until now it has shown the result
         trackers.finish(stopping)
+        if run.watch:
+            with suppress(OSError):
+                (run.directory / run_directory.OPERATOR_TOKEN).unlink()
 
 
 def _remedy(run: LocalRun) -> str:

@@ -28,6 +28,7 @@ from daedalus.cli.supervisor import (
 )
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
 from daedalus.learner.run.event_file import EventFile
+from daedalus.learner.run.run_directory import OPERATOR_TOKEN
 from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)
@@ -75,6 +76,8 @@ def train(
             if spec.evaluation.seconds is not None:
                 evaluating = (*options, "--evaluator")
                 actors.append(supervised_actor(_EVALUATOR, address, evaluating, output.pipes, output.last_error))
+            # Of a run that was killed, or of whoever has sent this directory: it must not count.
+            (run.directory / OPERATOR_TOKEN).unlink(missing_ok=True)
             if run.watch:
                 page.append(supervised_gateway(address, gateway_arguments(run), output.pipes))
             trackers.start()

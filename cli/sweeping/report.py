@@ -14,6 +14,7 @@ from daedalus.cli.comparing.tables import as_csv, as_text
 from daedalus.cli.sweeping.plan import PlannedRun
 from daedalus.cli.sweeping.sweep import SweepEnd
 from daedalus.learner.run.run_files import RunDataError
+from daedalus.policy.saving.replacing import replacing
 from daedalus.protocol.texts import one_line
 
 TABLE, RUNS, CURVES = "table.csv", "runs.csv", "curves.png"
@@ -39,7 +40,8 @@ def report(folder: Path, planned: Sequence[PlannedRun], end: SweepEnd, keys: Seq
     if ranked:
         groups.sort(key=_final_return, reverse=True)
     comparison = compare_groups(groups)
-    (folder / TABLE).write_text(as_csv(comparison), "utf-8", newline="")
+    with replacing(folder / TABLE) as beside:
+        beside.write_bytes(as_csv(comparison).encode())  # with the ends of lines that it has
     lines = ["", as_text(comparison), *problems]
     try:
         draw_curves(groups, folder / CURVES, ENV_STEPS)
@@ -60,7 +62,7 @@ def _failures(end: SweepEnd) -> str:
 
 def _write_runs(path: Path, planned: Sequence[PlannedRun], end: SweepEnd, keys: Sequence[str]) -> None:
     """Write one line for each run."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with replacing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         results = ("state", "final_return", "env_steps", "minutes", "reached_target")
         writer.writerow(["run", *(short(key, keys) for key in keys), "seed", *results])

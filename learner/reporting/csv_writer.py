@@ -13,6 +13,7 @@ import numpy as np
 
 from daedalus.learner.reporting.metrics import COLUMNS, Details
 from daedalus.learner.reporting.metrics_file import lasting, numbers
+from daedalus.policy.saving.regular_files import append_own
 from daedalus.policy.saving.replacing import replacing
 from daedalus.protocol.texts import exact_number
 
@@ -31,7 +32,7 @@ class CsvWriter:
         self._path = path
         _remove_partial_line(path)
         self._columns = _header(path)  # another release may have had other columns
-        self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+        self._file = append_own(path)
         if not self._columns:
             self._append(COLUMNS)
             self._columns = COLUMNS

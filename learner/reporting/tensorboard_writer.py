@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from daedalus.learner.reporting.metrics import Details, tag
+from daedalus.policy.saving.regular_files import append_own
 
 _BINS = 30  # of returns and lengths
 _MOST_BINS = 256  # of actions
@@ -40,7 +41,7 @@ class TensorBoardWriter:
         self._histogram_proto: Any = vars(summary_pb2)["HistogramProto"]
         now = time.time()
         name = f"events.out.tfevents.{int(now):010d}.{socket.gethostname()}.{os.getpid()}.{next(self._numbers)}"
-        self._writer = RecordWriter(open(directory / name, "ab"))  # noqa: SIM115 - closed in close()
+        self._writer = RecordWriter(append_own(directory / name))
         try:
             self._add(self._event(wall_time=now, file_version="brain.Event:2"))
         except OSError:  # a full disk: whoever tries again later would leave one empty file after the other

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.learner.run.run_directory import EVENTS
-from daedalus.policy.saving.regular_files import read_regular
+from daedalus.policy.saving.regular_files import append_own, read_regular
 from daedalus.protocol.status import Event
 from daedalus.protocol.timestamps import utc
 
@@ -51,7 +51,7 @@ class EventFile:
         if not events:
             return
         lines = "".join(json.dumps(event) + "\n" for event in events).encode()
-        with suppress(OSError), open(self._path, "ab", buffering=0) as file:
+        with suppress(OSError), append_own(self._path) as file:
             if file.tell() + len(lines) <= _MAX_BYTES:
                 file.write(lines)
 

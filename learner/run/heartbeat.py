@@ -9,6 +9,8 @@ import os
 import time
 from pathlib import Path
 
+from daedalus.policy.saving.regular_files import open_own, read_regular
+
 HEARTBEAT = "heartbeat"
 _BEAT_SECONDS = 1.0
 _MAX_SILENCE_SECONDS = 120.0  # longer than one update or one checkpoint takes
@@ -34,7 +36,7 @@ class Heartbeat:
             return
         self._due = now + _BEAT_SECONDS
         with contextlib.suppress(OSError):
-            file = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o644)  # not cut: a full disk has no room for more
+            file = open_own(self._path, os.O_WRONLY | os.O_CREAT, 0o644)  # not cut: a full disk has no room for more
             try:
                 os.pwrite(file, f"{now:017.3f} {_boot()}\n".encode(), 0)
             finally:
@@ -44,7 +46,7 @@ class Heartbeat:
 def silence(directory: Path) -> float | None:
     """Return for how many seconds the learner of a run has been silent, or None if that is no reason for concern."""
     try:
-        at, boot = (directory / HEARTBEAT).read_text().split()
+        at, boot = read_regular(directory / HEARTBEAT, 100).decode("ascii").split()
         age = time.monotonic() - float(at)
     except (OSError, ValueError):  # the learner is starting, or the file is being written
         return None

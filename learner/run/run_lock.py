@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.saving.regular_files import foreign_entry, open_own
 
 try:
     import fcntl
@@ -43,7 +44,9 @@ class RunLock:
         """
         self.directory = directory
         try:
-            self._descriptor = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+            if reason := foreign_entry(directory):  # somebody may have sent the directory
+                raise SettingsError(f"run directory {directory}: {reason}")
+            self._descriptor = open_own(directory / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise SettingsError(f"run directory {directory}: {error.strerror}") from None
         try:

@@ -29,7 +29,14 @@ from daedalus.policy.saving.saved_policy import (
     checkpoints,
     read_policy,
 )
-from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, UnreadableError, write_sealed
+from daedalus.policy.saving.sealed import (
+    DamagedError,
+    SealedDirectory,
+    UnreadableError,
+    is_unfinished,
+    remove_sealed,
+    write_sealed,
+)
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -83,9 +90,10 @@ def save_checkpoint(
     others = [other for other in checkpoints(run_directory) if other != directory]
     for old in others[keep - 1 :]:
         if old not in also_keep:
-            shutil.rmtree(old, ignore_errors=True)
+            remove_sealed(old)
     for unfinished in directory.parent.glob(".*"):  # left by a crash, or set aside
-        shutil.rmtree(unfinished, ignore_errors=True)
+        if is_unfinished(unfinished):
+            shutil.rmtree(unfinished, ignore_errors=True)
     return directory
 
 

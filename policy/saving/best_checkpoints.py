@@ -2,10 +2,9 @@
 
 import math
 import re
-import shutil
 from pathlib import Path
 
-from daedalus.policy.saving.sealed import link_sealed
+from daedalus.policy.saving.sealed import link_sealed, remove_sealed
 
 _BEST = re.compile(r"best_(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)_(\d{10,})", re.ASCII)
 _KEPT = 3  # scores over few episodes are noisy: with several, the best can be selected over more episodes
@@ -52,7 +51,7 @@ def keep_if_best(checkpoint: Path, score: float, policy_version: int) -> bool:
         return False
     link_sealed(checkpoint, target)
     for other in kept[_KEPT - 1 :]:
-        shutil.rmtree(other, ignore_errors=True)
+        remove_sealed(other)
     return rank == 0
 
 
@@ -77,7 +76,7 @@ def rescore(checkpoint: Path, score: float, policy_version: int) -> Path:
     if target != checkpoint:
         link_sealed(checkpoint, target)
         if is_best(checkpoint):
-            shutil.rmtree(checkpoint, ignore_errors=True)
+            remove_sealed(checkpoint)
     return target
 
 

@@ -1,6 +1,8 @@
 """Opening files that another machine, or somebody else, may have put there.
 
-A path can lead to a FIFO, whose opening waits for ever, or to a device, whose content never ends.
+A path can lead to a FIFO, whose opening waits for ever, or to a device, whose content never ends. In a run directory
+that somebody has sent, it can also be a link to a file of the receiver, which a run that goes on would overwrite:
+whoever writes into an existing run directory asks `foreign_entry` first, and opens its files with `open_own`.
 """
 
 import errno
@@ -10,6 +12,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 _NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # Windows has no FIFOs in folders
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_SHARING = "checkpoints"  # whose folders have files in common: those of the best
+_SEARCHED = (_SHARING, "logs")  # of a run, and of a sweep
+_REMEDY = "remove it, or copy the directory without it"
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -25,3 +31,57 @@ def read_regular(path: Path, limit: int) -> bytes:
     """Return the first `limit` bytes of a regular file. Raises OSError."""
     with open_regular(path) as file:
         return file.read(min(limit, os.fstat(file.fileno()).st_size))
+
+
+def open_own(path: str | Path, flags: int, mode: int = 0o666) -> int:
+    """Open a file of a run directory for writing, and return its descriptor. Never waits, and follows no link.
+
+    Raises OSError, also for what is no regular file, and for a file that has a name elsewhere, too (a hard link).
+    """
+    try:
+        descriptor = os.open(path, flags | _NO_LINK | _NONBLOCKING | getattr(os, "O_CLOEXEC", 0), mode)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(errno.ELOOP, "is a link", str(path)) from None
+        raise
+    if reason := _reason(os.fstat(descriptor)):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, reason, str(path))
+    return descriptor
+
+
+def append_own(path: Path) -> BinaryIO:
+    """Open a file of a run directory to append to it, unbuffered. See `open_own`."""
+    return open(path, "ab", buffering=0, opener=open_own)
+
+
+def foreign_entry(directory: Path) -> str:
+    """Return what is in a directory that no run writes there, with what to do, or an empty string.
+
+    That is a link, a FIFO, a device or a socket, and a file that has a name elsewhere, too. Of the folders in it, only
+    our own are searched: those of a tracker have links of its own. Raises OSError.
+    """
+    entries = list(os.scandir(directory))
+    shared = set[str]()
+    for entry in list(entries):
+        if entry.name in _SEARCHED and entry.is_dir(follow_symlinks=False):
+            inner = list(os.scandir(entry.path))
+            inner += [
+                each for folder in inner if folder.is_dir(follow_symlinks=False) for each in os.scandir(folder.path)
+            ]
+            entries += inner
+            shared |= {each.path for each in inner if entry.name == _SHARING}
+    for entry in entries:
+        found = entry.stat(follow_symlinks=False)
+        if not stat.S_ISDIR(found.st_mode) and (reason := _reason(found, shared=entry.path in shared)):
+            return f"{os.path.relpath(entry.path, directory)} {reason}: {_REMEDY}"
+    return ""
+
+
+def _reason(found: os.stat_result, *, shared: bool = False) -> str:
+    """Return why a file may not be written to, or an empty string. `shared`: it may have several names."""
+    if stat.S_ISLNK(found.st_mode):
+        return "is a link"
+    if not stat.S_ISREG(found.st_mode):
+        return "is not a regular file"
+    return "has a name elsewhere, too (a hard link)" if found.st_nlink > 1 and not shared else ""

@@ -7,6 +7,7 @@ policies by their own names; best_checkpoints.py handles the best of a run.
 
 import difflib
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -63,7 +64,7 @@ def checkpoints(run_directory: Path) -> list[Path]:
     folder = run_directory / "checkpoints"
     if not folder.is_dir():
         return []
-    return sorted((entry for entry in folder.iterdir() if entry.name.isdigit()), reverse=True)
+    return sorted((entry for entry in folder.iterdir() if re.fullmatch("[0-9]{10,}", entry.name)), reverse=True)
 
 
 def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:

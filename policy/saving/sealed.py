@@ -9,6 +9,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,19 @@ def link_sealed(directory: Path, target: Path) -> None:
     except OSError:
         shutil.rmtree(partial, ignore_errors=True)
         raise
+
+
+def remove_sealed(directory: Path) -> None:
+    """Remove a sealed directory. Anything else stays, such as a folder of the user with such a name, or a link."""
+    if not directory.is_symlink() and all((directory / name).is_file() for name in (MANIFEST, SEAL)):
+        shutil.rmtree(directory, ignore_errors=True)
+
+
+def is_unfinished(directory: Path) -> bool:
+    """Return whether a name is that of a sealed directory which was not finished, or was replaced or set aside."""
+    return (
+        re.fullmatch(r"\.(best_\S+_)?[0-9]{10,}(\.[0-9]+)?(\.(partial|replaced|damaged))?", directory.name) is not None
+    )
 
 
 def _move_into_place(partial: Path, directory: Path) -> None:

@@ -227,6 +227,19 @@ def test_older_checkpoints_are_pruned(tmp_path: Path) -> None:
     assert names(tmp_path) == ["0000000004", "0000000005"]
 
 
+def test_only_checkpoints_of_ours_are_removed(tmp_path: Path) -> None:
+    home, folder = tmp_path / "home", tmp_path / "checkpoints"
+    for path in (home, folder / "2024", folder / "0000000002", folder / ".config"):
+        path.mkdir(parents=True)
+        (path / "photo").write_text("precious")
+    (folder / "0000000003").symlink_to(home)
+    (folder / ".0000000000.77.partial").mkdir()
+    for version in (4, 5, 6):
+        save(tmp_path, version, keep=1)
+    assert names(tmp_path) == [".config", "0000000002", "0000000003", "0000000006", "2024"]
+    assert len(list(tmp_path.rglob("photo"))) == 4
+
+
 def test_saved_checkpoint_is_kept_when_a_damaged_one_has_a_higher_version(tmp_path: Path) -> None:
     save(tmp_path, 10)
     flip(save(tmp_path, 20) / "seal", 0)

@@ -33,6 +33,22 @@ def test_a_second_lock_is_refused_with_the_holder_until_the_first_is_closed(tmp_
     RunLock(tmp_path).close()
 
 
+@pytest.mark.parametrize("name", [LOCK, "metrics.csv", "events.jsonl", "checkpoints", "0"])
+def test_received_directory_with_links_is_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+    victim, run = tmp_path / "victim", tmp_path / "run"
+    run.mkdir()
+    victim.write_text("precious")
+    (run / name).symlink_to(victim)
+    with pytest.raises(SettingsError, match=rf"run directory .*/run: {name} is a link: remove it, or copy the"):
+        RunLock(run)
+    assert victim.read_text() == "precious"
+    assert os.listdir(run) == [name]
+    linked = tmp_path / "linked"  # the run directory itself may be a link
+    (run / name).unlink()
+    linked.symlink_to(run)
+    RunLock(linked).close()
+
+
 def test_whether_a_run_is_locked_can_be_asked(tmp_path: Path) -> None:
     assert not is_locked(tmp_path)
     with RunLock(tmp_path):

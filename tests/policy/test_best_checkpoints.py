@@ -16,12 +16,12 @@ from daedalus.policy.saving.best_checkpoints import (
     rescore,
     set_aside_newer,
 )
+from daedalus.policy.saving.sealed import write_sealed
 
 
 def checkpoint(run: Path, version: int) -> Path:
     directory = run / "checkpoints" / f"{version:010d}"
-    directory.mkdir(parents=True)
-    (directory / "content").write_text(str(version))
+    write_sealed(directory, {"content": str(version).encode()}, {})
     return directory
 
 
@@ -109,10 +109,10 @@ def full_disk(*_: Any) -> None:
 def test_checkpoint_is_copied_on_a_file_system_without_hard_links(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    directory = checkpoint(tmp_path, 1)
     monkeypatch.setattr(os, "link", no_links)
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", synced.append)
-    directory = checkpoint(tmp_path, 1)
     assert keep_if_best(directory, 5.0, 1)
     assert len(synced) == len([*directory.iterdir()]) + 2  # its files and both directories
     assert rescore(best_checkpoints(tmp_path)[0], 6.0, 1).name == "best_6.0_0000000001"
@@ -123,9 +123,9 @@ def test_checkpoint_is_copied_on_a_file_system_without_hard_links(
 def test_checkpoint_that_cannot_be_kept_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
+    directory = checkpoint(tmp_path, 1)
     monkeypatch.setattr(os, "link", no_links)
     monkeypatch.setattr(failing, full_disk)
-    directory = checkpoint(tmp_path, 1)
     with pytest.raises(OSError, match="No space left on device") as error:
         keep_if_best(directory, 5.0, 1)
     assert error.value.strerror == "No space left on device"
