@@ -1,6 +1,7 @@
 """Confirmation of a target that was reached: the learner waits while its launcher plays new episodes."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -42,14 +43,20 @@ class TargetConfirmation:
         """
         self._file, self._state = ConfirmationFile(state.directory), state
         self._events, self._stop, self._lock, self._beat = events, stop, lock, beat
+        self._not_before = -math.inf  # of the next attempt, on the monotonic clock
         self.result: dict[str, Any] | None = None  # of the new episodes that confirmed the target
 
     def confirm(self, policy_version: int, checkpointer: "Checkpointer") -> bool:
         """Wait until the launcher has played new episodes with the present policy, and return whether they confirm it.
 
-        If they do not, the newest returns are forgotten: the target has to be reached again. If the episodes cannot be
-        played, or nothing can be written to the disk, the target counts as reached without them.
+        If they do not, the newest returns are forgotten: the target has to be reached again, and training goes on for
+        at least as long as the attempt has lasted: attempts take at most half of the time. Until then, nothing is
+        played. If the episodes cannot be played, or nothing can be written to the disk, the target counts as reached
+        without them.
         """
+        began = time.monotonic()
+        if began < self._not_before:
+            return False
         if checkpointer.save() is None:
             return True
         training = self._state.spec.training
@@ -73,6 +80,8 @@ class TargetConfirmation:
             return True
         with self._lock:
             self._state.counters.forget_returns()
+        ended = time.monotonic()
+        self._not_before = ended + (ended - began)
         text = f"not confirmed: return {short_number(result['return_mean'])}; training continues"
         self._events.add("target", text, cause=f"result of version {policy_version}")
         return False

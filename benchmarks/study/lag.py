@@ -124,7 +124,10 @@ def _values(rows: dict[Cell, dict[str, str]], task: str, variant: str, lag: int,
 
 
 def _together(rows: dict[Cell, dict[str, str]]) -> str:
-    """Return the table over all tasks, with returns normalised: 0 a random policy, 1 the threshold of the task."""
+    """Return the table over all tasks, with returns normalised: 0 a random policy, 1 the threshold of the task.
+
+    Each task has a column beside the pool: a middle half of all runs may leave out a task that is not learnt.
+    """
     tasks = list(dict.fromkeys(cell.task for cell in rows))
     lines = []
     for variant, lag in _settings(rows):
@@ -134,8 +137,9 @@ def _together(rows: dict[Cell, dict[str, str]]) -> str:
         better = ""
         if lag and all(map(len, without)):
             better = written(improvement(strata, without), "{:.2f}".format)
-        lines.append((variant, lag, written(estimate(strata), "{:.3f}".format), better))
-    header = ("variant", "lag, updates", "normalised final return", "P(> lag 0)")
+        each = [written(estimate([scores]), "{:.2f}".format) for scores in strata]
+        lines.append((variant, lag, written(estimate(strata), "{:.3f}".format), *each, better))
+    header = ("variant", "lag, updates", "all", *tasks, "P(> lag 0)")
     return f"{', '.join(tasks)} together (0: random policy, 1: threshold)\n\n{table(header, lines)}"
 
 

@@ -30,12 +30,12 @@ def confirmation_arguments(spec: RunSpec) -> list[str]:
 def confirmation(result: dict[str, Any], target: float) -> dict[str, Any]:
     """Return the result of `daedalus evaluate` with two more entries.
 
-    `interval` is the 95 % interval of the mean (None of one episode). `confirmed` is False if the whole interval, or
-    the single return, is below the target.
+    `interval` is the 95 % interval of the mean (None of one episode). `confirmed`: the mean itself reaches the target.
+    So a policy whose true mean is the target is confirmed in half of the attempts, one that is one standard error below
+    it in 16 of 100, and two in 2 of 100. The upper end of the interval would accept them in 98, 84 and 49 of 100.
     """
     interval = mean_interval(result["return_mean"], result["return_std"], result["episodes"])
-    highest = result["return_mean"] if interval is None else interval[1]
-    return {**result, "interval": interval, "confirmed": highest >= target}
+    return {**result, "interval": interval, "confirmed": result["return_mean"] >= target}
 
 
 class Confirmations:

@@ -1,11 +1,15 @@
 """cli/confirmation.py: the interval of a mean, and episodes that nothing else of a run plays."""
 
+import math
+import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+from processes import until
 
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate_arguments import parser
@@ -13,19 +17,35 @@ from daedalus.cli.comparing.statistics import mean_interval
 from daedalus.cli.running import confirmation as module
 from daedalus.cli.running.confirmation import Confirmations, confirmation, confirmation_arguments
 from daedalus.learner.run.confirmation_file import ConfirmationFile
+from daedalus.learner.run.run_state import RunState
+from daedalus.learner.serving.events import EventLog
+from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec, RunSpec, TrainingSpec
 
+if TYPE_CHECKING:
+    from daedalus.learner.training.checkpointer import Checkpointer
+
 # 97.5 % quantiles of Student's distribution by degrees of freedom, from tables.
-QUANTILES = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 9: 2.262, 30: 2.042, 99: 1.984, 9999: 1.960}
+QUANTILES = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706, 6: 2.4469, 7: 2.3646, 8: 2.3060, 9: 2.2622}
+QUANTILES |= {10: 2.2281, 15: 2.1314, 20: 2.0860, 30: 2.0423, 60: 2.0003, 99: 1.9842, 200: 1.9719, 9999: 1.9602}
 
 
 @pytest.mark.parametrize(("freedom", "quantile"), QUANTILES.items())
 def test_interval_is_that_of_students_distribution(freedom: int, quantile: float) -> None:
     values = np.random.default_rng(1).normal(size=freedom + 1)
-    expected = quantile * values.std(ddof=1) / (freedom + 1) ** 0.5
+    values /= values.std(ddof=1) / (freedom + 1) ** 0.5
+    expected = quantile
     interval = mean_interval(10.0, float(values.std()), freedom + 1)
     assert interval is not None
-    assert interval == pytest.approx((10.0 - expected, 10.0 + expected), rel=0.005)
+    assert interval == pytest.approx((10.0 - expected, 10.0 + expected), abs=1e-4)
+
+
+def test_interval_holds_95_percent_of_students_density_for_each_number_of_episodes() -> None:
+    for freedom in range(1, 260):
+        _, quantile = mean_interval(0.0, freedom**0.5, freedom + 1) or (0.0, 0.0)
+        angles = np.linspace(0.0, np.arctan(quantile / freedom**0.5), 2001)  # t = sqrt(freedom) tan(angle)
+        constant = 2 * math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.pi**0.5
+        assert constant * np.trapezoid(np.cos(angles) ** (freedom - 1), angles) == pytest.approx(0.95, abs=1e-5)
 
 
 def test_interval_contains_the_mean_of_the_distribution_in_95_of_100_cases() -> None:
@@ -44,8 +64,16 @@ def test_single_episode_has_no_interval_and_decides_alone(mean: float, target: f
     assert (result["interval"], result["confirmed"]) == (None, confirmed)
 
 
-@pytest.mark.parametrize(("target", "confirmed"), [(9.0, True), (11.9, True), (12.1, False), (50.0, False)])
-def test_target_is_not_confirmed_if_the_whole_interval_is_below_it(target: float, confirmed: bool) -> None:
+def test_a_policy_below_the_target_is_rarely_confirmed() -> None:
+    """True mean 460, target 475, standard error 10: 1.5 standard errors. The interval's upper end confirmed 69 %."""
+    returns = np.random.default_rng(3).normal(460.0, 100.0, size=(4000, 100))
+    results = [{"return_mean": each.mean(), "return_std": each.std(), "episodes": 100} for each in returns]
+    odds = np.mean([[confirmation(result, target)["confirmed"] for target in (475.0, 460.0)] for result in results], 0)
+    assert odds == pytest.approx([0.067, 0.5], abs=0.02)
+
+
+@pytest.mark.parametrize(("target", "confirmed"), [(9.0, True), (10.0, True), (10.1, False), (11.9, False)])
+def test_target_is_confirmed_if_the_mean_reaches_it(target: float, confirmed: bool) -> None:
     """The interval of 100 episodes of mean 10 and standard deviation 9.95 is 10 +- 1.984 x 9.95 / sqrt(99)."""
     result = confirmation({"return_mean": 10.0, "return_std": 9.95, "episodes": 100}, target)
     assert result["interval"] == pytest.approx((8.016, 11.984), abs=1e-3)
@@ -120,3 +148,37 @@ def test_learner_that_asks_again_gets_the_result_of_the_version_that_it_asks_for
     confirmations.poll()
     assert [each.name for each in InstantProcess.started] == ["0000000450", "0000000451"]
     assert file.answered(451) is not None
+
+
+def test_after_an_attempt_training_goes_on_for_as_long_as_it_took(tmp_path: Path) -> None:
+    spec = RunSpec(
+        environment=EnvironmentSpec(id="A-v0"), training=TrainingSpec(target_return=475.0, target_episodes=1)
+    )
+    state, events, stop = RunState(tmp_path, spec, 0.0), EventLog(), threading.Event()
+    learner = TargetConfirmation(state, events, stop, lock=threading.Condition(), beat=lambda: None)
+    file, checkpointer = ConfirmationFile(tmp_path), cast("Checkpointer", SimpleNamespace(save=lambda: tmp_path))
+
+    def launch() -> None:
+        while not stop.wait(0.3):
+            if (version := file.asked()) is not None:
+                result = {"return_mean": 480.0 if version == 3 else 470.0, "return_std": 0.0, "episodes": 1}
+                file.answer(version, confirmation(result, 475.0))
+
+    launcher = threading.Thread(target=launch)
+    launcher.start()
+    try:
+        state.counters.returns.append(480.0)
+        assert not learner.confirm(1, checkpointer)
+        assert not state.counters.reached(475.0)
+        for _ in range(100):  # as many updates at once
+            assert not learner.confirm(2, checkpointer)
+        assert [event.text for event in events.report() if event.kind == "target"] == [
+            "target 475 reached: the policy of this moment plays 1 new episodes to confirm it",
+            "not confirmed: return 470.0; training continues",
+        ]
+        until(lambda: learner.confirm(3, checkpointer))
+    finally:
+        stop.set()
+        launcher.join()
+    assert learner.result is not None
+    assert learner.result["return_mean"] == 480.0
