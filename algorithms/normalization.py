@@ -1,6 +1,9 @@
 """Running statistics of observations and returns, and the normalisation of rewards. State; no I/O, no threads."""
 
-from collections.abc import Sequence
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -10,18 +13,28 @@ from torch import Tensor
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.running_returns import RunningReturns
 from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.protocol.keys import first_of_largest_owner, owner
 from daedalus.protocol.uploads import Rollout
 
 _LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
 _LARGEST_MEAN = 5.0  # of the scaled returns: that of episodes of a thousand equal rewards, at a discount factor of 0.99
 _PART_NUMBERS = 4 << 20  # numbers whose moments are computed at a time
+_MOST_VALUES = 1_000_000.0  # that running moments stand for: older ones fade
+_VOTES, _MANY_VOTES = 8, 64  # of each actor: on components of many numbers, and of few
+_FEW_VOTES = 3  # of other actors, until a vote can be far outside theirs
+_VOTE_NUMBERS = 4 << 20  # numbers in the votes of all actors on one component
+_LARGEST_RATIO = 10.0  # of a vote that counts in full, to what is confirmed
+_FAR = 1e5  # ratio of a vote that is far outside, to all that other actors have shown
+_CONSTANT = 1e-9  # ratio of the deviation of a constant to its size: rounding
+_RECENT = 4  # times the rows of all votes: moments of no more may be forgotten
+_ESTABLISHED = 8192.0  # values, from which on moments are a witness of their own
 _LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly
 
 
 class Moments(NamedTuple):
     """Number, mean and sum of squared deviations of some values, in float64."""
 
-    number: int
+    number: int | Tensor  # of values, or their weights [*shape]
     mean: Tensor  # [*shape]
     squares: Tensor  # [*shape]
 
@@ -30,7 +43,7 @@ def moments_of(values: Tensor) -> Moments:
     """Return the moments of values [N, *shape]; those of no values are 0."""
     rows = max(_PART_NUMBERS // max(values[:1].numel(), 1), 1)
     if len(values) > rows:  # in float64 all of them, such as a batch of images, could take gigabytes
-        merged = RunningMoments(tuple(values.shape[1:]))
+        merged = RunningMoments(tuple(values.shape[1:]), most=math.inf)
         for part in values.split(rows):
             merged.add(part)
         return Moments(len(values), merged.mean, merged.squares)
@@ -40,20 +53,22 @@ def moments_of(values: Tensor) -> Moments:
 
 
 class RunningMoments:
-    """Mean and variance of all values seen, each value weighted equally, in float64.
+    """Mean and variance of all values seen, in float64.
 
-    Batches are merged by the parallel formula of Chan, Golub and LeVeque (1979).
+    Batches are merged by the parallel formula of Chan, Golub and LeVeque (1979). Each value has the same weight until
+    there are `most`; from then on the older ones fade, as if only the newest `most` had been seen.
     """
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
+    def __init__(self, shape: tuple[int, ...], *, most: float = _MOST_VALUES) -> None:
         self.mean = torch.zeros(shape, dtype=torch.float64)
         self.squares = torch.zeros(shape, dtype=torch.float64)  # sum of squared deviations from the mean
-        self.count = torch.zeros((), dtype=torch.float64)
+        self.count = torch.zeros(shape, dtype=torch.float64)
+        self._most = most
 
     @property
     def variance(self) -> Tensor:
         """Variance [*shape]; 1 before any value was seen."""
-        return self.squares / self.count if self.count > 0 else torch.ones_like(self.squares)
+        return torch.where(self.count > 0, self.squares / self.count.clamp(min=1e-300), 1.0)
 
     def add(self, values: Tensor) -> None:
         """Add values [N, *shape]."""
@@ -61,17 +76,283 @@ class RunningMoments:
 
     def merge(self, others: Moments) -> None:
         """Add the values that the moments are of."""
-        number = others.number
-        if not number:
-            return
-        total, difference = self.count + number, others.mean - self.mean
+        number = torch.as_tensor(others.number, dtype=torch.float64)
+        kept = ((self._most - number) / self.count.clamp(min=1.0)).clamp(0.0, 1.0)
+        self.count *= kept
+        self.squares *= kept
+        total, difference = (self.count + number).clamp(min=1e-300), others.mean - self.mean
         self.squares += others.squares + difference.square() * self.count * number / total
         self.mean += difference * number / total
         self.count += number
 
+    def forget(self, which: Tensor) -> None:
+        """Forget all that was seen in some of the numbers, a mask [*shape]."""
+        for values in (self.mean, self.squares, self.count):
+            values.masked_fill_(which, 0.0)
+
     def state(self) -> dict[str, Tensor]:
         """Return the state for a checkpoint."""
         return {"mean": self.mean, "squares": self.squares, "count": self.count}
+
+
+class ConfirmedRange:
+    """The range of the numbers of one component, by the word of more than one rollout and more than one actor.
+
+    Running moments weigh every value equally, so that a single rollout of 1e15 would fix them for the rest of a run.
+    Here each rollout is a *vote*: in each number, its mean m, its deviation s and its magnitude (m^2 + s^2)^(1/2). Each
+    actor has its newest 8 votes, and an *owner* (protocol/keys.py) has those of its actors. What all of them show but
+    the largest eighth is confirmed: the largest of 2 to 9 votes, actors or owners does not count. With
+
+        c = the median of the actors' median m
+        d = ((m - c)^2 + s^2)^(1/2), of each vote
+        R = the confirmed d; max(1, |c|) in a number that was constant
+
+    a vote counts with f = min(1, 10 R / d): n values become f n, and their distances from c are multiplied by f. So a
+    vote adds at most 10 R to a deviation however large it is, and the less, the larger it is. Within 10 R, which means
+    in nearly all of training, nothing is changed. Numbers that grow are followed as soon as they are confirmed, by a
+    second actor, or by the second or third rollout of the only one.
+
+    Moments whose magnitude is above ten times all that the votes show are of a past that nothing confirms, such as a
+    bad first rollout: they are forgotten. And a vote 1e5 times above everything that any *other* actor has ever shown,
+    and above 1, is far outside: it is none, and its rollout has nothing to learn from. A single actor has no others.
+
+    The votes are not saved: after a resume, the restored moments stand in for them until an actor has 8 votes or there
+    is a second one.
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        numbers = max(math.prod(shape), 1)
+        self._votes = min(max(_MANY_VOTES * 16 // numbers, _VOTES), _MANY_VOTES)  # of each actor
+        self._most_voters = min(max(_VOTE_NUMBERS // (2 * self._votes * numbers), 2), 64)
+        self._voters: dict[str, _Voter] = {}  # by actor, the one that was heard last at the end
+        self._heard = 0  # votes so far
+        self._summary: _Summary | None = None
+
+    def add(self, actor: str, moments: Moments) -> None:
+        """Add the moments of a rollout as a vote of its actor."""
+        if not moments.number:
+            return
+        voter = self._voters.pop(actor, None) or _Voter(self._votes)
+        self._heard += 1
+        voter.add(moments, self._heard)
+        self._voters[actor] = voter
+        silent = self._heard - 32 * len(self._voters)
+        gone = [name for name, each in self._voters.items() if each.heard < silent]
+        if len(self._voters) > self._most_voters:
+            gone.append(first_of_largest_owner(self._voters))
+        for name in gone:
+            self.forget(name)
+        if self._summary is not None and self._heard >= self._summary.heard + len(self._voters):
+            self._summary = None  # in a large fleet it is computed after many votes
+
+    def forget(self, actor: str) -> None:
+        """Forget all votes of an actor."""
+        if self._voters.pop(actor, None) is not None:
+            self._summary = None
+
+    def is_far(self, actor: str, moments: Moments) -> bool:
+        """Return whether moments are far outside all that the other actors have shown."""
+        if not moments.number or not (magnitude := _magnitude(moments)).max(initial=0.0) > _FAR:
+            return False
+        others = [voter for name, voter in self._voters.items() if name != actor]
+        if sum(len(voter.means) for voter in others) < _FEW_VOTES:
+            return False
+        largest = np.max([voter.largest for voter in others], 0).clip(min=1.0)
+        return bool((magnitude > _FAR * largest).any())
+
+    def forget_unconfirmed(self, moments: RunningMoments) -> None:
+        """Forget running moments that are far above all votes, if these are of enough rows to say so."""
+        if not self._voters:
+            return
+        summary = self._summarized()
+        mean, variance, count = moments.mean.numpy(), moments.variance.numpy(), moments.count.numpy()
+        magnitude = np.sqrt(mean**2 + variance)
+        unconfirmed = (magnitude > np.minimum(_LARGEST_RATIO * summary.shown, _FAR * summary.recent)) & (count > 0)
+        if unconfirmed.any():
+            moments.forget(torch.from_numpy(unconfirmed & (summary.rows >= count / _RECENT)))
+
+    def shares(self, moments: Moments, past: RunningMoments | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return c and f of the moments of a rollout, each [*shape]; `past`: what they are about to be added to."""
+        mean = moments.mean.numpy()
+        if not self._voters or not moments.number:
+            return mean, np.ones_like(mean)
+        summary = self._summarized()
+        center, scale = summary.center, summary.scale
+        if past is not None and (summary.is_even or summary.is_few):  # the past decides between two halves
+            known, past_mean = past.count.numpy() >= _ESTABLISHED, past.mean.numpy()
+            decided = past_mean if summary.is_few else _median([*summary.centers, past_mean])
+            if (known & (decided != center)).any():
+                center = np.where(known, decided, center)
+                scale = self._scale(center)
+            if summary.is_few:
+                scale = np.where(known, np.minimum(scale, past.variance.sqrt().numpy()), scale)
+        size = np.abs(center).clip(min=1.0)
+        most = _LARGEST_RATIO * np.where(scale > _CONSTANT * size, scale, size)
+        distance = np.sqrt((mean - center) ** 2 + _variance(moments))
+        return center, most / np.maximum(distance, most)
+
+    def moderated(self, moments: Moments, past: RunningMoments | None = None) -> Moments:
+        """Return the moments of a rollout as they count; see the class."""
+        center, shares = self.shares(moments, past)
+        if (shares == 1.0).all():
+            return moments
+        share, middle = torch.from_numpy(shares), torch.from_numpy(center)
+        mean = torch.where(share < 1.0, middle + share * (moments.mean - middle), moments.mean)
+        # Squares are a sum over the rows, which are fewer as well.
+        return Moments(moments.number * share, mean, share**3 * moments.squares)
+
+    def _summarized(self) -> "_Summary":
+        if self._summary is None:
+            voters = list(self._voters.values())
+            centers = self._of_owners(_median, lambda voter: voter.center)
+            recent = self._of_owners(_confirmed, lambda voter: _confirmed(voter.magnitudes))
+            shown = self._of_owners(lambda values: np.max(values, 0), lambda voter: voter.second)
+            apart = _VOTES if len(centers) > 2 else 0  # of two owners, either may be right
+            center = _median(centers)
+            self._summary = _Summary(
+                heard=self._heard,
+                centers=centers,
+                center=center,
+                scale=self._scale(center),
+                recent=_confirmed(recent, most=apart).clip(min=1.0),
+                shown=_confirmed(shown, most=apart).clip(min=1.0),
+                rows=sum(sum(voter.rows) for voter in voters),
+                is_few=len(voters) == 1 and len(voters[0].means) < _VOTES,
+            )
+        return self._summary
+
+    def _scale(self, center: np.ndarray) -> np.ndarray:
+        """Return R [*shape], 0 in a number that was constant."""
+
+        def of_voter(voter: _Voter) -> np.ndarray:
+            return _confirmed(np.sqrt((np.array(voter.means) - center) ** 2 + np.array(voter.variances)))
+
+        return _confirmed(self._of_owners(_confirmed, of_voter), most=_VOTES)
+
+    def _of_owners(
+        self, together: Callable[[list[np.ndarray]], np.ndarray], each: Callable[["_Voter"], np.ndarray]
+    ) -> list[np.ndarray]:
+        """Return what each owner's actors show together."""
+        of_owners: dict[str, list[np.ndarray]] = {}
+        for name, voter in self._voters.items():
+            of_owners.setdefault(owner(name), []).append(each(voter))
+        return [together(values) for values in of_owners.values()]
+
+
+class _Voter:
+    """The newest votes of one actor."""
+
+    def __init__(self, votes: int) -> None:
+        self.means: deque[np.ndarray] = deque(maxlen=votes)
+        self.variances: deque[np.ndarray] = deque(maxlen=votes)
+        self.rows: deque[int] = deque(maxlen=votes)
+        self.center = np.zeros(())  # median of the means [*shape]
+        self.largest = self.second = np.zeros(())  # largest magnitudes [*shape] that it has ever shown
+        self.heard = 0
+
+    def add(self, moments: Moments, heard: int) -> None:
+        self.means.append(moments.mean.numpy())
+        self.variances.append(_variance(moments))
+        self.rows.append(int(moments.number))
+        self.center = _median(self.means)
+        magnitude = _magnitude(moments)
+        self.second = np.maximum(self.second, np.minimum(magnitude, self.largest)) if self.heard else magnitude
+        if len(self.means) == 2:  # the first vote was the only one
+            self.second = np.minimum(magnitude, self.largest)
+        self.largest = np.maximum(magnitude, self.largest)
+        self.heard = heard
+
+    @property
+    def magnitudes(self) -> np.ndarray:
+        """Magnitudes of the votes [votes, *shape]."""
+        return np.sqrt(np.array(self.means) ** 2 + np.array(self.variances))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Summary:
+    """What the votes say together; arrays [*shape]."""
+
+    heard: int  # votes when it was made
+    centers: list[np.ndarray]  # of the owners
+    center: np.ndarray  # c
+    scale: np.ndarray  # R, 0 in a number that was constant
+    recent: np.ndarray  # magnitude that the votes of one actor confirm, at least 1
+    shown: np.ndarray  # magnitude that one actor has ever shown twice, at least 1
+    rows: int  # of all votes
+    is_few: bool  # one actor, with few votes
+
+    @property
+    def is_even(self) -> bool:
+        return len(self.centers) % 2 == 0
+
+
+def _confirmed(values: Sequence[np.ndarray] | np.ndarray, most: int = 1) -> np.ndarray:
+    """Return the largest of values [N, *shape] without the largest eighth, rounded up to at most `most`; of one, it."""
+    number = len(values)
+    last = number - 1 - min((number + 6) // 8, most) if number > 1 else 0
+    return np.partition(np.asarray(values), last, 0)[last]
+
+
+def _median(values: Sequence[np.ndarray] | deque[np.ndarray]) -> np.ndarray:
+    """Return the median of values, each [*shape]; of the two in the middle the one nearer to 0."""
+    ordered = np.sort(np.array(values), 0)
+    lower, upper = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    return np.where(np.abs(lower) <= np.abs(upper), lower, upper)
+
+
+def _variance(moments: Moments) -> np.ndarray:
+    return moments.squares.numpy() / float(moments.number)
+
+
+def _magnitude(moments: Moments) -> np.ndarray:
+    return np.sqrt(moments.mean.numpy() ** 2 + _variance(moments))
+
+
+class ConfirmedRanges:
+    """The ranges of all components that actors send numbers of, by name. State; no I/O."""
+
+    def __init__(self) -> None:
+        self._ranges: dict[str, ConfirmedRange] = {}
+
+    def vote(self, actor: str, moments: Mapping[str, Moments]) -> str:
+        """Add the moments of a rollout as votes of its actor, and return an empty string.
+
+        If one of them is far outside, return the name of its component instead, and forget all votes of the actor.
+        """
+        for name, each in moments.items():
+            if name not in self._ranges:
+                self._ranges[name] = ConfirmedRange(tuple(each.mean.shape))
+        far = next((name for name, each in moments.items() if self._ranges[name].is_far(actor, each)), "")
+        for name, each in moments.items():
+            if far:
+                self._ranges[name].forget(actor)
+            else:
+                self._ranges[name].add(actor, each)
+        return far
+
+    def merge(self, name: str, moments: Sequence[Moments], into: RunningMoments) -> None:
+        """Add the moments of rollouts to running ones, each as it counts. Call after `vote`."""
+        self._ranges[name].forget_unconfirmed(into)
+        for each in moments:
+            into.merge(self._ranges[name].moderated(each, into))
+
+    def share(self, name: str, moments: Moments) -> float:
+        """Return with how much of their size the numbers of a rollout count, from 0 to 1. Call after `vote`."""
+        return float(self._ranges[name].shares(moments, None)[1].min())
+
+    def moderated(self, name: str, number: float) -> float:
+        """Return a number that an actor states of a rollout, as it counts. Call after `vote`."""
+        return float(self._ranges[name].moderated(one(number)).mean)
+
+
+def one(number: float) -> Moments:
+    """Return the moments of one number, with which an actor votes on it."""
+    return Moments(1, torch.tensor(number, dtype=torch.float64), torch.zeros((), dtype=torch.float64))
+
+
+def observations_name(component: str) -> str:
+    """Return the name of the moments of an observation component, in gradients and events."""
+    return f"observations/{component}"
 
 
 class ObservationStatistics:
@@ -92,23 +373,24 @@ class ObservationStatistics:
             moments.squares.copy_(variance * _LOADED_COUNT)
             moments.count.fill_(_LOADED_COUNT)
 
-    def add(self, batch: Batch) -> None:
-        """Add the observations of the valid rows, and set the normaliser's statistics.
+    def moments_of(self, batch: Batch, columns: slice = slice(None)) -> dict[str, Moments]:
+        """Return the moments of the observations of the valid rows of some environments, by component."""
+        rows = batch.valid[:, columns].bool()
+        return {name: moments_of(batch.observations[name][:-1, columns][rows]) for name in self.moments}
+
+    def merge(self, parts: Mapping[str, Sequence[Moments]], ranges: ConfirmedRanges) -> None:
+        """Add observations by the moments of their rollouts, by component, and set the normaliser's statistics.
 
         Call after the updates of the batch: they learn with the statistics that the actors acted with.
         """
-        self.merge([self.moments_of(batch)])
-
-    def moments_of(self, batch: Batch) -> dict[str, Moments]:
-        """Return the moments of the observations of the valid rows, by component."""
-        rows = batch.valid.bool()
-        return {name: moments_of(batch.observations[name][:-1][rows]) for name in self.moments}
-
-    def merge(self, parts: Sequence[dict[str, Moments]]) -> None:
-        """Add observations by their moments, and set the normaliser's statistics. See `add`."""
         for name, moments in self.moments.items():
-            for part in parts:
-                moments.merge(part[name])
+            ranges.merge(observations_name(name), parts[name], moments)
+            self._normalizer.set_statistics(name, moments.mean, moments.variance)
+
+    def reset(self) -> None:
+        """Forget all observations."""
+        for name, moments in self.moments.items():
+            moments.forget(moments.count > 0)
             self._normalizer.set_statistics(name, moments.mean, moments.variance)
 
 
@@ -127,13 +409,15 @@ class RewardNormalizer:
         self.moments = RunningMoments(())
         self._returns = RunningReturns(discount_factor, synchronous=synchronous)
 
-    def add(self, rollouts: Sequence[Rollout]) -> None:
-        """Add the returns of rollouts to the statistics."""
-        self.moments.merge(self.moments_of(rollouts))
-
     def moments_of(self, rollouts: Sequence[Rollout]) -> Moments:
-        """Return the moments of the returns of the rows to learn from. Call it once for each rollout, in order."""
-        seen = [self._returns.add(rollout)[rollout.learned] for rollout in rollouts]
+        """Return the moments of the returns of the rows to learn from. Call it once for each rollout, in order.
+
+        A return that goes on into the next rollout counts with at most ten times the size of those seen so far: one
+        false reward must not spoil all later rollouts of the episode.
+        """
+        seen_before = float((self.moments.mean.square() + self.moments.variance).sqrt())
+        largest = _LARGEST_RATIO * max(seen_before, 1.0) if self.moments.count > 0 else math.inf
+        seen = [self._returns.add(rollout, largest)[rollout.learned] for rollout in rollouts]
         return moments_of(torch.from_numpy(np.concatenate(seen)))
 
     def scale(self, batch: Batch) -> None:
@@ -141,3 +425,7 @@ class RewardNormalizer:
         deviation, mean = float(self.moments.variance.sqrt()), float(self.moments.mean)
         divisor = max(deviation, abs(mean) / _LARGEST_MEAN, 1e-8)
         batch.rewards.div_(divisor).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
+
+    def reset(self) -> None:
+        """Forget all returns."""
+        self.moments.forget(self.moments.count > 0)

@@ -13,7 +13,7 @@ from daedalus.algorithms.diagnostics import BATCH_METRICS, batch_metrics, diagno
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, restored, unpacked
 from daedalus.algorithms.gradients import GradientComputer
-from daedalus.algorithms.normalization import Moments, ObservationStatistics, RewardNormalizer
+from daedalus.algorithms.normalization import Moments, ObservationStatistics, RewardNormalizer, observations_name
 from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
@@ -88,7 +88,7 @@ class RolloutGradients:
         Rewards are normalised as the learner would: with the statistics of the snapshot and of the rollout itself.
         """
         batch = self._assembler.join([rollout])
-        moments = {f"observations/{name}": part for name, part in self._observations.moments_of(batch).items()}
+        moments = {observations_name(name): part for name, part in self._observations.moments_of(batch).items()}
         if self._rewards is not None:
             moments["returns"] = self._rewards.moments_of([rollout])
             if moments["returns"].squares.isfinite():  # else the learner rejects this gradient, and not the next one

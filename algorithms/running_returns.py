@@ -30,8 +30,11 @@ class RunningReturns:
         self._discount_factor, self._synchronous = discount_factor, synchronous
         self._running: dict[_Stream, np.ndarray] = {}  # G [E] after the last row, by what comes next
 
-    def add(self, rollout: Rollout) -> np.ndarray:
-        """Return G [T, E] of a rollout. Call once for each rollout, in order."""
+    def add(self, rollout: Rollout, largest: float = np.inf) -> np.ndarray:
+        """Return G [T, E] of a rollout. Call once for each rollout, in order.
+
+        The next rollout of the stream begins with a G of at most `largest`, positive or negative.
+        """
         none = np.zeros(rollout.environments)
         running = self._running.pop(self._stream(rollout, 0), none)
         if len(running) != len(none):
@@ -43,7 +46,9 @@ class RunningReturns:
             returns[row] = running
             running = np.where(goes_on[row], running, 0.0)
         # An actor does not check its rewards: one that is not finite must not reach its later rollouts.
-        self._running[self._stream(rollout, rollout.rows)] = np.where(np.isfinite(running), running, 0.0)
+        self._running[self._stream(rollout, rollout.rows)] = np.where(np.isfinite(running), running, 0.0).clip(
+            -largest, largest
+        )
         if len(self._running) > _MAX_STREAMS:
             del self._running[next(iter(self._running))]
         return returns

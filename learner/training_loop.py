@@ -107,7 +107,12 @@ class TrainingLoop:
         left_out = self._learn_from(batch, progress)
         learner.anneal_exploration(self._state.spec.training.exploration_annealing(progress, env_steps))
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights, len(batch))
-        rollouts.count_trained(batch, left_out)
+        rollouts.count_trained(batch, left_out, learner.far_outside)
+        if learner.far_outside:
+            now = time.monotonic()
+            self._health.note_far_outside(
+                {each.identity.actor: name for each, name in learner.far_outside.items()}, now
+            )
         self._health.updated = self._health.actor_seen = time.monotonic()
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:

@@ -1,9 +1,10 @@
 """Health of a learner process: what its status reports as problems. State; no I/O."""
 
-from collections.abc import Callable, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Set
+from dataclasses import dataclass, field
 
 _STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
+_FAR_SECONDS = 60.0  # so long after a rollout far outside what others send, its sender is a problem
 _NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
 
 
@@ -17,9 +18,16 @@ class Health:
     saved: float | None = None  # time of the last checkpoint
     save_fault: str = ""  # error of the last checkpoint, if it failed
     left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
+    # By actor whose rollouts were left out because their numbers are far outside: which numbers, and the last time.
+    far_outside: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     gradient_fault: bool = False  # whether the last update was skipped
     # Days until the certificate of this process expires, or None without one.
     certificate_days_left: Callable[[], float | None] = lambda: None
+
+    def note_far_outside(self, components: Mapping[str, str], now: float) -> None:
+        """Note actors whose rollouts were left out because numbers are far outside, and their components."""
+        recent = {name: each for name, each in self.far_outside.items() if now - each[1] < _FAR_SECONDS}
+        self.far_outside = recent | {name: (component, now) for name, component in components.items()}
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
@@ -37,6 +45,11 @@ class Health:
             names = sorted(self.left_out)
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
             found.append(f"batches do not wait for {', '.join(names[:5])}{more}: connected, but without rollouts")
+        far = {name: each for name, (each, last) in self.far_outside.items() if now - last < _FAR_SECONDS}
+        if far:
+            names = [f"{name} ({component})" for name, component in sorted(far.items())]
+            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+            found.append(f"rollouts with numbers far outside those of other actors: {', '.join(names[:5])}{more}")
         if self.gradient_fault:
             found.append("updates are skipped: the gradient is not finite")
         if self.save_fault:

@@ -9,8 +9,20 @@ from daedalus.protocol.messages import UNKNOWN, Origin
 from daedalus.protocol.texts import bounded_text
 
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
-_MAX_NON_FINITE = 3  # rollouts without a finite gradient, after which the incarnation is quarantined
-_FINITE_AGAIN = 100  # rollouts in a row with finite gradients, after which those before no longer count
+_MAX_FAULTS = 3  # rollouts that were left out of an update, after which the incarnation is quarantined
+_GOOD_AGAIN = 100  # rollouts in a row that were learned from, after which the faults before no longer count
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Why a rollout was left out of an update: the category that it is counted under, and what it has."""
+
+    cause: str
+    what: str
+    hint: str = ": examine its environment"
+
+
+NON_FINITE = Fault("non_finite", "no finite gradient", ": its observations or rewards are too large")
 
 
 @dataclass(slots=True)
@@ -32,8 +44,8 @@ class Actor:
     busy: int = 0  # number of `busy` answers
     missed_earlier: int = 0  # rollouts of earlier incarnations that never arrived
     consecutive_unfit: int = 0  # rollouts that violate the specification
-    non_finite: int = 0  # rollouts without a finite gradient
-    finite_in_a_row: int = 0  # rollouts that were trained on since
+    faults: int = 0  # rollouts that were left out of an update
+    good_in_a_row: int = 0  # rollouts that were learned from since
     quarantined: str = ""  # the reason, if the newest incarnation is quarantined
     drained: bool = False  # whether an operator asked the newest incarnation to leave
     env_steps: int = 0
@@ -66,23 +78,21 @@ class Actor:
         if self.consecutive_unfit >= _MAX_CONSECUTIVE_UNFIT:
             self.quarantined = bounded_text(f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}")
 
-    def count_trained(self, *, finite: bool) -> None:
-        """Count a rollout that was trained on. Quarantine the actor if several had no finite gradient.
+    def count_trained(self, fault: Fault | None = None) -> None:
+        """Count a rollout that was trained on, or left out for a fault. Quarantine the actor after several faults.
 
         Unlike a rejected rollout, such a rollout costs the learner much time. Therefore it takes many good ones to make
         up for it.
         """
-        if finite:
-            self.finite_in_a_row += 1
-            if self.finite_in_a_row >= _FINITE_AGAIN:
-                self.non_finite = 0
+        if fault is None:
+            self.good_in_a_row += 1
+            if self.good_in_a_row >= _GOOD_AGAIN:
+                self.faults = 0
             return
-        self.rejected["non_finite"] += 1
-        self.non_finite, self.finite_in_a_row = self.non_finite + 1, 0
-        if self.non_finite >= _MAX_NON_FINITE:
-            self.quarantined = (
-                f"{self.non_finite} of its rollouts had no finite gradient: its observations or rewards are too large"
-            )
+        self.rejected[fault.cause] += 1
+        self.faults, self.good_in_a_row = self.faults + 1, 0
+        if self.faults >= _MAX_FAULTS:
+            self.quarantined = bounded_text(f"{self.faults} of its rollouts had {fault.what}{fault.hint}")
 
     def start_incarnation(self, incarnation: int, next_sequence: int = 0) -> None:
         """Set the newest incarnation, without quarantine; its sequence numbers below `next_sequence` were received."""
@@ -90,7 +100,7 @@ class Actor:
         self.missed_earlier = self.missed
         self.incarnation, self.sequences = incarnation, SequenceWindow(low=next_sequence)
         self.incarnations += 1
-        self.consecutive_unfit = self.non_finite = self.finite_in_a_row = 0
+        self.consecutive_unfit = self.faults = self.good_in_a_row = 0
         self.left = False
         self.quarantined, self.drained = "", False
         self.fetches = self.compact_snapshots = False

@@ -16,11 +16,13 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
+from types import MappingProxyType
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.updates import updates_of
+from daedalus.learner.serving.actor_state import NON_FINITE, Fault
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.gradient_checks import Shapes
@@ -174,27 +176,37 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
-    def count_trained(self, rollouts: Sequence[Upload], left_out: Sequence[Upload]) -> None:
+    def count_trained(
+        self,
+        rollouts: Sequence[Upload],
+        left_out: Sequence[Upload],
+        far_outside: Mapping[Upload, str] = MappingProxyType({}),
+    ) -> None:
         """Count the rollouts of a batch for their senders, after its updates.
 
         Args:
           rollouts: the rollouts of the batch.
           left_out: those that were left out of updates, because they have no finite gradient.
+          far_outside: those that were left out because they are far outside what others send; and their components.
         """
         with self._lock:
             for rollout in rollouts:
-                finite = not any(rollout is each for each in left_out)
+                fault = None
+                if any(rollout is each for each in left_out):
+                    fault = NON_FINITE
+                elif rollout in far_outside:
+                    fault = Fault("outside", f"numbers far outside those of the other actors ({far_outside[rollout]})")
                 actor = self._fleet.find(rollout.identity)
                 if actor is not None:
-                    actor.count_trained(finite=finite)
-                if not finite:
-                    self._count_non_finite(rollout.identity.actor, actor)
+                    actor.count_trained(fault)
+                if fault is not None:
+                    self._count_fault(fault, rollout.identity.actor, actor)
 
-    def _count_non_finite(self, name: str, actor: Actor | None) -> None:
+    def _count_fault(self, fault: Fault, name: str, actor: Actor | None) -> None:
         self._fleet.changed()
-        self._counters.rollouts_rejected["non_finite"] += 1
-        text = f"a rollout of actor {name!r} has no finite gradient, and was left out"
-        self._events.add("rejected", text, actor=name, cause="non_finite", level=logging.WARNING)
+        self._counters.rollouts_rejected[fault.cause] += 1
+        text = f"a rollout of actor {name!r} has {fault.what}, and was left out"
+        self._events.add("rejected", text, actor=name, cause=fault.cause, level=logging.WARNING)
         if actor is not None and actor.quarantined:
             text = f"quarantined: {actor.quarantined}"
             self._events.add("quarantined", text, actor=name, level=logging.WARNING)

@@ -1,7 +1,9 @@
 """The parameters, the optimiser and the policy version, and their updates. No threads, no I/O."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +14,15 @@ from daedalus.algorithms.diagnostics import FirstPass, batch_metrics, diagnostic
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, exact, packed
 from daedalus.algorithms.gradients import GradientComputer, Terms
-from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
+from daedalus.algorithms.normalization import (
+    ConfirmedRanges,
+    Moments,
+    ObservationStatistics,
+    RewardNormalizer,
+    moments_of,
+    observations_name,
+    one,
+)
 from daedalus.learner.ranks.leader import NO_OTHER_RANKS, OtherRanks
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.run.updates import updates_of
@@ -24,8 +34,7 @@ from daedalus.learner.training.received_gradients import (
     diagnostics_of,
     mean_gradient,
     mean_terms,
-    observation_moments,
-    return_moments,
+    moments_in,
 )
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
@@ -34,7 +43,13 @@ from daedalus.policy.network.exploration import ANNEALING
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
-from daedalus.protocol.uploads import Gradient, Rollout
+from daedalus.protocol.uploads import Gradient, Rollout, Upload
+
+# Names of what actors vote on besides components of observations (algorithms/normalization.py).
+_RETURNS, _REWARDS, _NORM, _METRICS = "returns", "rewards", "gradient norm", "metrics/"
+
+_Seen = dict[str, Moments]
+_Upload = TypeVar("_Upload", Rollout, Gradient)
 
 
 class Learner:
@@ -81,6 +96,9 @@ class Learner:
         self._rewards: RewardNormalizer | None = None
         if spec.normalize_rewards:
             self._rewards = RewardNormalizer(spec.discount_factor, synchronous=spec.record.synchronous)
+        self._ranges, self._reward_name = ConfirmedRanges(), _REWARDS if self._rewards is None else _RETURNS
+        self._reward_shares: dict[Rollout, float] = {}  # of the newest batch: with how much of their size they count
+        self.far_outside: dict[Upload, str] = {}  # of the newest batch: what was left out, and its component
         self.first_pass: FirstPass | None = None  # of the newest batch, until its memory is used for the next one
         self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
         self.metrics = UpdateMetrics(spaces, self.device)
@@ -105,24 +123,69 @@ class Learner:
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
         end = self.policy_version + updates_of(self._spec, rollouts, memory=self.state_size > 0)
-        if self._rewards is not None:
-            self._rewards.add(rollouts)
-        kept, left_out = list(rollouts), []
-        while kept and not self._make_updates(kept, progress, end):
+        batch, kept, seen = self._sorted_out(rollouts)
+        left_out: list[Rollout] = []
+        while kept and not self._make_updates(batch, progress, end):
             at_fault = rollouts_at_fault(self._gradients, lambda some: self._joined(some).to(self.device), kept)
             left_out += at_fault
             kept = [rollout for rollout in kept if not any(rollout is each for each in at_fault)] if at_fault else []
+            batch = self._joined(kept) if kept else batch
+        self._merge_observations([seen[rollout] for rollout in kept])
         self.updates_skipped += end - self.policy_version
         self.policy_version = end
         return left_out
 
-    def _make_updates(self, rollouts: Sequence[Rollout], progress: float, end: int) -> bool:
+    def _sorted_out(self, rollouts: Sequence[Rollout]) -> tuple[Batch, list[Rollout], dict[Rollout, _Seen]]:
+        """Return the batch to learn from, its rollouts, and the moments of each: without those that are far outside.
+
+        If all are, there is no other to tell which are right: then nothing is left out.
+        """
+        batch, first = self._assembler.join(rollouts), 0
+        seen: dict[Rollout, _Seen] = {}
+        for rollout in rollouts:
+            seen[rollout] = self._moments_of(rollout, batch, slice(first, first + rollout.environments))
+            first += rollout.environments
+        kept = self._without_far(rollouts, seen)
+        if self._rewards is not None:
+            self._ranges.merge(
+                self._reward_name, [seen[each][self._reward_name] for each in kept], self._rewards.moments
+            )
+        self._reward_shares = {
+            each: self._ranges.share(self._reward_name, seen[each][self._reward_name]) for each in kept
+        }
+        if len(kept) < len(rollouts):
+            batch = self._assembler.join(kept)
+        return self._scaled(batch, kept), kept, seen
+
+    def _moments_of(self, rollout: Rollout, batch: Batch, columns: slice) -> _Seen:
+        """Return what a rollout votes on. `columns`: its environments in the batch."""
+        seen = {observations_name(name): each for name, each in self._observations.moments_of(batch, columns).items()}
+        for name, frames in rollout.frames.items():
+            if frames.dtype.kind == "f" and observations_name(name) not in seen:
+                seen[observations_name(name)] = one(float(np.abs(frames).max()))
+        if self._rewards is not None:
+            seen[self._reward_name] = self._rewards.moments_of([rollout])
+        else:
+            seen[self._reward_name] = moments_of(torch.from_numpy(rollout.rewards[rollout.learned]))
+        return seen
+
+    def _without_far(self, uploads: Sequence[_Upload], seen: Mapping[_Upload, _Seen]) -> list[_Upload]:
+        """Let each upload vote on the ranges, and return those that are not far outside."""
+        far = {each: self._ranges.vote(each.identity.actor, seen[each]) for each in uploads}
+        kept = [each for each in uploads if not far[each]]
+        self.far_outside = {each: name for each, name in far.items() if name} if kept else {}
+        return kept or list(uploads)
+
+    def _merge_observations(self, seen: Sequence[_Seen]) -> None:
+        names = self._observations.moments
+        parts = {name: [each[observations_name(name)] for each in seen] for name in names}
+        self._observations.merge(parts, self._ranges)
+
+    def _make_updates(self, batch: Batch, progress: float, end: int) -> bool:
         """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
-        batch = self._joined(rollouts)
         part = self._other_ranks.part(batch, self.constants, self.policy_version, end, progress)
         if not self.learn_from(part, progress, end):
             return False
-        self._observations.add(batch)
         if self.first_pass is not None:
             self.first_pass = self._other_ranks.collect(self.first_pass)
             self.metrics.add_batch_metrics(batch_metrics(self.first_pass))
@@ -165,33 +228,61 @@ class Learner:
     def apply(self, gradients: Sequence[Gradient], progress: float) -> None:
         """Make one update with the mean of gradients that actors computed, weighted by their env_steps.
 
-        The intake has checked that each is finite.
+        The intake has checked that each is finite. Those that are far outside are left out, as in `step`; the norm of
+        another one counts with at most ten times what is confirmed, so that none decides the direction alone.
 
         Args:
           gradients: the gradients of the batch, in order.
           progress: as for `step`.
         """
+        stated = {
+            gradient: {
+                **moments_in(gradient),
+                _NORM: one(gradient.norm),
+                **{_METRICS + name: one(float(value)) for name, value in gradient.metrics.items()},
+            }
+            for gradient in gradients
+        }
+        kept = [self._moderated(gradient) for gradient in self._without_far(gradients, stated)]
+        seen = [moments_in(gradient) for gradient in kept]
         if self._rewards is not None:
-            for gradient in gradients:
-                self._rewards.moments.merge(return_moments(gradient))
-        self._flat.gradients.copy_(mean_gradient(gradients, tuple(self.gradient_shapes)))
-        if self._make_update(mean_terms(gradients, self.device), progress):
-            components = tuple(self._observations.moments)
-            self._observations.merge([observation_moments(gradient, components) for gradient in gradients])
-            for gradient in gradients:
+            self._ranges.merge(_RETURNS, [each[_RETURNS] for each in seen], self._rewards.moments)
+        self._flat.gradients.copy_(mean_gradient(kept, tuple(self.gradient_shapes)))
+        if self._make_update(mean_terms(kept, self.device), progress):
+            self._merge_observations(seen)
+            for gradient in kept:
                 if (measured := batch_metrics_of(gradient)) is not None:
                     self.metrics.add_batch_metrics(measured.to(self.device))
         else:
             self.policy_version += 1
             self.updates_skipped += 1
-        self._received_diagnostics = diagnostics_of(gradients[-1])
-        for gradient in gradients:
+        self._received_diagnostics = diagnostics_of(kept[-1])
+        for gradient in kept:
             counts = gradient.action_counts.items()
             self.metrics.add_action_counts({name: torch.from_numpy(values.copy()) for name, values in counts})
 
+    def _moderated(self, gradient: Gradient) -> Gradient:
+        """Return a gradient with the norm and the metrics that count."""
+        norm, values = gradient.norm, gradient.gradient
+        if (most := self._ranges.moderated(_NORM, norm)) < norm:
+            values = {name: each * np.float32(most / norm) for name, each in values.items()}
+        metrics = {
+            name: np.array(self._ranges.moderated(_METRICS + name, float(value)), np.float32)
+            for name, value in gradient.metrics.items()
+        }
+        return replace(gradient, gradient=values, metrics=metrics)
+
     def _joined(self, rollouts: Sequence[Rollout]) -> Batch:
-        """Return the batch of the rollouts, with normalised rewards, in main memory."""
-        batch = self._assembler.join(rollouts)
+        """Return the batch of the rollouts, with scaled rewards, in main memory."""
+        return self._scaled(self._assembler.join(rollouts), rollouts)
+
+    def _scaled(self, batch: Batch, rollouts: Sequence[Rollout]) -> Batch:
+        """Scale the rewards of a batch in place: normalised ones, and those that are not confirmed to what counts."""
+        first = 0
+        for rollout in rollouts:
+            if (share := self._reward_shares.get(rollout, 1.0)) < 1.0:
+                batch.rewards[:, first : first + rollout.environments] *= share
+            first += rollout.environments
         if self._rewards is not None:
             self._rewards.scale(batch)
         return batch
@@ -295,16 +386,25 @@ class Learner:
             self._gradients.forward.update_target()
         self._observations.take_from_network()
 
+    def reset_statistics(self) -> None:
+        """Forget the running statistics of observations and returns: the next rollouts define them."""
+        self._observations.reset()
+        if self._rewards is not None:
+            self._rewards.reset()
+
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
         """Restore a version from the results of `weights` and `state`; training then continues exactly as before.
 
-        Raises CheckpointMismatchError if they belong to another network or optimiser.
+        Only what is needed to doubt a rollout is not saved (algorithms/normalization.py). Raises
+        CheckpointMismatchError if the results belong to another network or optimiser.
         """
         self.load(parameters)
         if self._network.exploration is not None and ANNEALING in parameters:
             self._network.exploration.set_annealing(float(parameters[ANNEALING].item()))
         for name, statistic in self._statistics().items():
             saved = state.get(name)
+            if saved is not None and name.endswith("/count") and not saved.shape:
+                saved = saved.expand(statistic.shape)  # in checkpoints of earlier releases: one count for all numbers
             if saved is None or saved.shape != statistic.shape:
                 raise CheckpointMismatchError(
                     f"the checkpoint lacks the statistics {name!r}: restore training.optimizer, "

@@ -56,16 +56,8 @@ def diagnostics_of(gradient: Gradient) -> dict[str, float]:
     return {name: float(value) for name, value in gradient.metrics.items() if name not in others}
 
 
-def observation_moments(gradient: Gradient, components: Sequence[str]) -> dict[str, Moments]:
-    """Return the moments of the normalised components."""
-    return {name: _moments(gradient, f"observations/{name}") for name in components}
-
-
-def return_moments(gradient: Gradient) -> Moments:
-    """Return the moments of the discounted returns."""
-    return _moments(gradient, "returns")
-
-
-def _moments(gradient: Gradient, name: str) -> Moments:
-    mean, squares = torch.from_numpy(gradient.moments[name].copy())
-    return Moments(gradient.env_steps, mean, squares)
+def moments_in(gradient: Gradient) -> dict[str, Moments]:
+    """Return the moments of the rollout, by name."""
+    return {
+        name: Moments(gradient.env_steps, *torch.from_numpy(values.copy())) for name, values in gradient.moments.items()
+    }

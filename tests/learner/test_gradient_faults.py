@@ -20,6 +20,7 @@ from building import (
 )
 
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.actor_state import NON_FINITE
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
@@ -125,9 +126,9 @@ def test_no_sender_is_at_fault_if_the_parameters_are() -> None:
 def test_actor_is_quarantined_after_three_rollouts_at_fault() -> None:
     actor = Actor("a")
     for _ in range(2):
-        actor.count_trained(finite=False)
+        actor.count_trained(NON_FINITE)
     assert not actor.quarantined
-    actor.count_trained(finite=False)
+    actor.count_trained(NON_FINITE)
     assert actor.quarantined.startswith("3 of its rollouts had no finite gradient")
     assert actor.rejected == {"non_finite": 3}
 
@@ -136,9 +137,9 @@ def test_few_good_rollouts_in_between_do_not_prevent_the_quarantine() -> None:
     """Each such rollout costs the learner much time: a sender of one in ten must not go on for ever."""
     actor = Actor("a")
     for _ in range(3):
-        actor.count_trained(finite=False)
+        actor.count_trained(NON_FINITE)
         for _ in range(99):
-            actor.count_trained(finite=True)
+            actor.count_trained()
     assert actor.quarantined
 
 
@@ -146,18 +147,18 @@ def test_a_hundred_good_rollouts_make_up_for_the_rollouts_at_fault() -> None:
     actor = Actor("a")
     for _ in range(5):
         for _ in range(2):
-            actor.count_trained(finite=False)
+            actor.count_trained(NON_FINITE)
         for _ in range(100):
-            actor.count_trained(finite=True)
+            actor.count_trained()
     assert not actor.quarantined
 
 
 def test_new_incarnation_starts_with_a_clean_record() -> None:
     actor = Actor("a")
     for _ in range(2):
-        actor.count_trained(finite=False)
+        actor.count_trained(NON_FINITE)
     actor.start_incarnation(2)
-    actor.count_trained(finite=False)
+    actor.count_trained(NON_FINITE)
     assert not actor.quarantined
 
 

@@ -1,5 +1,6 @@
 """algorithms/normalization.py, running_returns.py: statistics equal those of all values, however they arrive."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,16 @@ from building import POLICY, identity, join, make_rollout
 from plain import NAME, plain
 
 from daedalus.algorithms import normalization, running_returns
-from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer, RunningMoments, moments_of
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.normalization import (
+    ConfirmedRanges,
+    Moments,
+    ObservationStatistics,
+    RewardNormalizer,
+    RunningMoments,
+    moments_of,
+    observations_name,
+)
 from daedalus.algorithms.running_returns import RunningReturns
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.normalization import ObservationNormalizer
@@ -29,7 +39,7 @@ def test_moments_of_batches_equal_those_of_all_values(offset: float) -> None:
     assert moments.variance.eq(1.0).all()
     for part in np.split(values, [1, 2, 30, 30, 77]):  # one is empty
         moments.add(torch.from_numpy(part))
-    assert moments.count == 100
+    assert moments.count.eq(100).all()
     np.testing.assert_allclose(moments.mean, values.mean(0), rtol=1e-12)
     np.testing.assert_allclose(moments.variance, values.var(0), rtol=1e-6)
 
@@ -64,6 +74,16 @@ def discounted_sums(rollouts: list[Rollout]) -> list[float]:
     return found
 
 
+def add(normalizer: RewardNormalizer, rollouts: list[Rollout]) -> None:
+    normalizer.moments.merge(normalizer.moments_of(rollouts))
+
+
+def observe(statistics: ObservationStatistics, batch: Batch) -> None:
+    ranges, moments = ConfirmedRanges(), statistics.moments_of(batch)
+    ranges.vote("a", {observations_name(name): each for name, each in moments.items()})
+    statistics.merge({name: [each] for name, each in moments.items()}, ranges)
+
+
 def sent(sequence: int, actor: str = "a", incarnation: int = 1, environments: int = 3) -> Rollout:
     rollout = make_rollout(
         identity(actor, sequence, incarnation), seed=10 * sequence + ord(actor), environments=environments
@@ -93,7 +113,7 @@ def test_returns_run_on_over_the_rollouts_of_a_stream(streams: list[list[Rollout
     if len({each.identity.actor for each in rollouts}) > 1:
         rollouts.sort(key=lambda rollout: rollout.identity.sequence)  # the actors take turns
     for start in range(0, len(rollouts), size):
-        normalizer.add(rollouts[start : start + size])
+        add(normalizer, rollouts[start : start + size])
     expected = [value for stream in streams for value in discounted_sums(stream)]
     assert normalizer.moments.count == len(expected)
     assert float(normalizer.moments.mean) == pytest.approx(np.mean(expected), rel=1e-5)
@@ -116,7 +136,7 @@ def test_a_reward_that_is_not_finite_does_not_reach_the_next_episode_or_rollout(
 
 def test_rewards_are_divided_by_the_deviation_and_clipped() -> None:
     normalizer = RewardNormalizer(DISCOUNT)
-    normalizer.add([sent(0)])
+    add(normalizer, [sent(0)])
     batch = join([sent(1)])
     batch.rewards[0, 0] = 1e6
     rewards = batch.rewards.clone()
@@ -165,8 +185,8 @@ def test_returns_of_the_agents_of_a_client_run_on_agent_by_agent(stack: int) -> 
     normalizer = RewardNormalizer(0.99)
     rounds = 60
     for turn in range(rounds):
-        normalizer.add([played(2 * turn, 16 * turn, 1.0, stack=stack)])
-        normalizer.add([played(2 * turn + 1, 10_000 + 16 * turn, -1.0, stack=stack)])
+        add(normalizer, [played(2 * turn, 16 * turn, 1.0, stack=stack)])
+        add(normalizer, [played(2 * turn + 1, 10_000 + 16 * turn, -1.0, stack=stack)])
     returns = (1.0 - 0.99 ** np.arange(1, 16 * rounds + 1)) / 0.01
     expected = np.concatenate([returns, -returns]).std()
     assert float(normalizer.moments.variance) ** 0.5 == pytest.approx(expected, rel=0.01)
@@ -180,7 +200,7 @@ def test_returns_of_one_agent_run_on_whatever_few_observations_it_has(synchronou
         rollout = played(sequence, 0, 1.0, rows=rows)
         rollout.frames[NAME][0], rollout.frames[NAME][-1] = first, random.integers(4)
         first = rollout.frames[NAME][-1].copy()
-        normalizer.add([rollout])
+        add(normalizer, [rollout])
     expected = (1.0 - 0.9 ** np.arange(1, 100 * rows + 1)) / 0.1
     assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
 
@@ -188,7 +208,7 @@ def test_returns_of_one_agent_run_on_whatever_few_observations_it_has(synchronou
 def test_returns_run_on_over_rows_that_a_client_does_not_send() -> None:
     """As in runs of a2c, while the client waits for the next policy."""
     normalizer = RewardNormalizer(0.5, synchronous=True)
-    normalizer.add([played(0, 0, 1.0), played(1, 100, 1.0)])
+    add(normalizer, [played(0, 0, 1.0), played(1, 100, 1.0)])
     expected = (1.0 - 0.5 ** np.arange(1, 33)) / 0.5
     assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
 
@@ -222,7 +242,7 @@ def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None
             "choice": random.integers(0, 3, (7, 3, 1), np.uint8),
         }
         rollout = replace(rollout, frames={NAME: plain(rollout.frames), **more})
-        statistics.add(join([rollout], Spaces(observations=spaces, actions=ACTIONS)))
+        observe(statistics, join([rollout], Spaces(observations=spaces, actions=ACTIONS)))
         for name, values in seen.items():
             values.append(rollout.frames[name][:-1][rollout.valid])
     for name, values in seen.items():
@@ -239,7 +259,168 @@ def test_statistics_that_came_with_weights_change_slowly() -> None:
     network.normalizer.set_statistics(NAME, torch.full((3,), 50.0), torch.full((3,), 4.0))
     statistics = ObservationStatistics(network.normalizer)
     statistics.take_from_network()
-    statistics.add(join([make_rollout()]))
+    observe(statistics, join([make_rollout()]))
     mean, variance = network.normalizer.statistics(NAME)
     assert ((mean - 50.0).abs() < 0.1).all()
     assert ((variance - 4.0).abs() < 0.5).all()
+
+
+# ------------------------------------------------------------------------- what one rollout or actor cannot spoil
+
+
+class Votes:
+    """Running moments of one component [2], from rollouts of 100 rows: what they are, and who was far outside."""
+
+    def __init__(self) -> None:
+        self.moments, self.ranges, self.far = RunningMoments((2,)), ConfirmedRanges(), list[str]()
+        self.random = np.random.default_rng(1)
+        self.honest: list[np.ndarray] = []
+
+    def send(self, actor: str, values: np.ndarray, *, is_honest: bool = True) -> None:
+        moments = moments_of(torch.from_numpy(values.astype(np.float64)))
+        if self.ranges.vote(actor, {"x": moments}):
+            self.far.append(actor)
+        else:
+            self.ranges.merge("x", [moments], self.moments)
+        if is_honest:
+            self.honest.append(values)
+
+    def play(self, actors: str, rollouts: int, *, mean: float = 0.0, deviation: float = 1.0) -> None:
+        """Let actors send honest rollouts in turns."""
+        for turn in range(rollouts):
+            self.send(actors[turn % len(actors)], mean + deviation * self.random.standard_normal((100, 2)))
+
+    def signs(self, size: float) -> np.ndarray:
+        return size * self.random.choice([-1.0, 1.0], (100, 2))
+
+    @property
+    def deviation(self) -> np.ndarray:
+        return self.moments.variance.sqrt().numpy()
+
+    @property
+    def expected(self) -> np.ndarray:
+        return np.concatenate(self.honest).std(0)
+
+
+@pytest.mark.parametrize("size", [30.0, 1e4, 9e14])
+@pytest.mark.parametrize("constant", [True, False])
+@pytest.mark.parametrize("before", [0, 1, 50])
+@pytest.mark.parametrize("actors", ["a", "ab"])
+def test_one_rollout_does_not_spoil_the_statistics(actors: str, before: int, constant: bool, size: float) -> None:
+    """Nor if it is the first one. Averaged in, it would: by a factor of 1e12 after 200 more."""
+    votes = Votes()
+    votes.play(actors, before)
+    votes.send("a", np.full((100, 2), -size) if constant else votes.signs(size), is_honest=False)
+    votes.play(actors, 100)
+    assert (votes.deviation < 2.0).all()
+    assert (votes.deviation > 0.9).all()
+    assert (votes.moments.mean.abs() < 0.5).all()
+
+
+@pytest.mark.parametrize("size", [30.0, 1e4, 9e14])
+def test_an_actor_that_sends_much_does_not_spoil_the_statistics(size: float) -> None:
+    """Whether it sends a sixth, as here, or begins before the others."""
+    for first in (0, 20):
+        votes = Votes()
+        for _ in range(first):
+            votes.send("z", votes.signs(size), is_honest=False)
+        for _ in range(100):
+            votes.play("abcde", 5)
+            votes.send("z", votes.signs(size), is_honest=False)
+        assert (votes.deviation < 6.0).all()
+        assert set(votes.far) == ({"z"} if size > 1e5 else set())
+
+
+def test_actors_of_one_owner_do_not_confirm_each_other() -> None:
+    votes = Votes()
+    for turn in range(100):
+        votes.play("ab", 2)
+        votes.send(f"z.{turn % 10}", votes.signs(1e4), is_honest=False)
+    assert (votes.deviation < 3.0).all()
+
+
+def one_hot(votes: Votes, actor: str, share: float) -> np.ndarray:
+    return (votes.random.random((100, 2)) < share).astype(np.float64)
+
+
+HONEST = {
+    "numbers": lambda votes, actor, turn: votes.random.standard_normal((100, 2)),
+    "large numbers that differ little": lambda votes, actor, turn: 1e5 + votes.random.standard_normal((100, 2)),
+    "tiny numbers": lambda votes, actor, turn: 1e-6 * votes.random.standard_normal((100, 2)),
+    "sparse flags": lambda votes, actor, turn: one_hot(votes, actor, 0.003),
+    "a flag of each actor": lambda votes, actor, turn: np.full((100, 2), [actor == "a", actor == "b"], np.float64),
+    "constants": lambda votes, actor, turn: np.full((100, 2), [0.0, 0.1]),
+    "a position that moves on": lambda votes, actor, turn: turn + votes.random.standard_normal((100, 2)),
+    "one that grows": lambda votes, actor, turn: 1.05**turn * votes.random.standard_normal((100, 2)),
+    "few values": lambda votes, actor, turn: votes.random.integers(0, 256, (100, 2)).astype(np.float64),
+}
+
+
+@pytest.mark.parametrize("actors", ["a", "ab", "abc"])
+@pytest.mark.parametrize("values", HONEST.values(), ids=HONEST)
+def test_honest_numbers_count_in_full(values: Callable[[Votes, str, int], np.ndarray], actors: str) -> None:
+    votes = Votes()
+    for turn in range(150):
+        actor = actors[turn % len(actors)]
+        votes.send(actor, values(votes, actor, turn))
+    assert not votes.far
+    np.testing.assert_allclose(votes.deviation, votes.expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(votes.moments.mean, np.concatenate(votes.honest).mean(0), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("actors", ["a", "ab", "abcdefgh"])
+@pytest.mark.parametrize(("before", "after"), [(0.0, 1.0), (0.0, 1000.0), (1.0, 1000.0), (1.0, 1e5), (1e-3, 1.0)])
+def test_numbers_that_jump_are_followed(actors: str, before: float, after: float) -> None:
+    """As when the goal is found for the first time, or a sensor that was constant is used."""
+    votes = Votes()
+    votes.play(actors, 1000, deviation=before)
+    votes.honest.clear()
+    votes.play(actors, 24, deviation=after)
+    assert not votes.far
+    share = 24 / 1024
+    assert (votes.deviation > 0.5 * after * share**0.5).all()
+
+
+@pytest.mark.parametrize("actors", ["a", "ab", "abcdefgh"])
+def test_rare_rewards_that_are_much_larger_are_neither_far_outside_nor_forgotten(actors: str) -> None:
+    """A goal worth 1,000 in one rollout of twenty, and -0.01 for each row elsewhere."""
+    votes = Votes()
+    for turn in range(600):
+        found = votes.random.random() < 0.05
+        votes.send(
+            actors[turn % len(actors)], np.full((100, 2), -0.01) + (found * 1000.0) * (np.arange(100) > 90)[:, None]
+        )
+    assert not votes.far
+    assert (votes.deviation > 1.0).all()
+    # What counts of the goal is far above the largest that the network sees of it, 10 deviations.
+    assert (1000.0 / votes.deviation > 3.0).all()
+
+
+def test_restored_statistics_stand_in_for_the_votes() -> None:
+    """After a resume the first rollout may be the bad one."""
+    votes = Votes()
+    votes.play("a", 100)
+    votes.ranges = ConfirmedRanges()
+    votes.send("a", votes.signs(9e14), is_honest=False)
+    assert (votes.deviation < 1.5).all()
+
+
+def test_old_values_fade() -> None:
+    """A million values at 100, and as many of 1: the deviation between them is forgotten step by step."""
+    moments = RunningMoments(())
+    moments.mean.fill_(100.0)
+    moments.count.fill_(1e6)
+    moments.squares.fill_(1e6 * 1e4)
+    for _ in range(1000):
+        moments.merge(Moments(10_000, torch.tensor(1.0, dtype=torch.float64), torch.tensor(1e4, dtype=torch.float64)))
+    assert moments.count == 1e6
+    assert float(moments.mean) == pytest.approx(1.0, abs=0.1)
+    assert float(moments.variance) == pytest.approx(1.0, abs=1.0)
+
+
+def test_a_false_reward_does_not_reach_the_later_rollouts_of_the_episode() -> None:
+    normalizer = RewardNormalizer(0.99)
+    for turn in range(30):
+        add(normalizer, [played(turn, 16 * turn, 1.0)])
+    normalizer.moments_of([played(30, 480, 1e9)])
+    assert float(normalizer.moments_of([played(31, 496, 1.0)]).mean) < 1e3

@@ -1,0 +1,83 @@
+"""Attack: an authorised actor spoils what a run has learned about the size of observations and rewards.
+
+    python -m benchmarks.attack.spoiled_statistics
+
+CartPole with the default settings and two honest actors. Early in the run a third one sends one rollout with
+observations of +-9e14, one with rewards of +-1e9, or 700 of the first kind, rejoining when it is quarantined; or, for
+half of the run, values a thousand times too large, which no quarantine ends. Each run must reach 95 % of the return
+that it has without the attack.
+"""
+
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+
+from benchmarks.attack._hostile_actor import HostileActor
+from benchmarks.attack.verdict import Verdict
+from benchmarks.chaos.scene import Scene, read_json, scene
+
+_ENV_STEPS = 100_000
+_BEGIN, _END = 5_000, 50_000  # env_steps of the run, between which it is attacked
+_RETURN = 475.0  # 95 % of 500, the largest of CartPole, which the run has without an attack
+_MESSAGES = 700
+
+
+def spoiled_statistics() -> Verdict:
+    """Attack four runs, and return whether each has learned."""
+    returns = {kind.__name__: _attacked(kind) for kind in (observations, rewards, flood, broken_sensor)}
+    text = ", ".join(f"{name.replace('_', ' ')} {value:.0f}" for name, value in returns.items())
+    return Verdict(min(returns.values()) >= _RETURN, f"return after each attack, at least {_RETURN:g}: {text}")
+
+
+def _attacked(attack: Callable[[HostileActor, Scene], object] | None) -> float:
+    with scene() as here:
+        settings = ("--seed", 1, "--env-steps", _ENV_STEPS, "--set", "evaluation.final_episodes=1")
+        run = here.start("train", "--env", "CartPole-v1", "--listen", here.address, "--run-dir", "run", *settings)
+        here.wait("training", lambda: here.env_steps() > _BEGIN)
+        if attack is not None:
+            with closing(HostileActor(here.address, "hostile")) as hostile:
+                attack(hostile, here)
+        here.wait("the end", lambda: run.process.poll() is not None)
+        return read_json(here.folder / "run" / "summary.json")["episode_return_mean"]
+
+
+def _signs(hostile: HostileActor) -> np.ndarray:
+    return np.random.default_rng(1).choice([-1.0, 1.0], (hostile.rows + 1, 1, 4)).astype(np.float32)
+
+
+def _frames(hostile: HostileActor, size: float) -> dict[str, Any]:
+    return {"frames": {"observation": size * _signs(hostile)}}
+
+
+def observations(hostile: HostileActor, here: Scene) -> None:
+    """Send one rollout with observations of +-9e14."""
+    hostile.send(**_frames(hostile, 9e14))
+
+
+def rewards(hostile: HostileActor, here: Scene) -> None:
+    """Send one rollout with rewards of +-1e9."""
+    hostile.send(rewards=1e9 * _signs(hostile)[1:, :, 0])
+
+
+def flood(hostile: HostileActor, here: Scene) -> None:
+    """Send 700 rollouts with observations of +-9e14."""
+    for _ in range(_MESSAGES):
+        if here.env_steps() >= _ENV_STEPS:
+            return
+        if hostile.send(**_frames(hostile, 9e14)).verdict == "quarantined":
+            hostile.join()
+
+
+def broken_sensor(hostile: HostileActor, here: Scene) -> None:
+    """Send rollouts with observations and rewards of +-1,000 for a while."""
+    while here.env_steps() < _END:
+        hostile.send(**_frames(hostile, 1e3), rewards=1e3 * _signs(hostile)[1:, :, 0])
+
+
+if __name__ == "__main__":
+    verdict = spoiled_statistics()
+    print(verdict)
+    sys.exit(0 if verdict.held else 1)
