@@ -34,7 +34,8 @@ def main() -> None:
         run = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
         try:
             address = page_address(run)
-            _take(address, parsed.output, parsed.seconds)
+            token = (Path(folder) / "cartpole-impala-s1" / "operator-token").read_text().strip()
+            _take(address, token, parsed.output, parsed.seconds)
         finally:
             run.terminate()
             run.wait()
@@ -50,7 +51,7 @@ def page_address(run: subprocess.Popen[str]) -> str:
     raise SystemExit("the run did not start")
 
 
-def _take(address: str, folder: Path, seconds: float) -> None:
+def _take(address: str, token: str, folder: Path, seconds: float) -> None:
     sync_api: Any = importlib.import_module("playwright.sync_api")  # an extra
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
@@ -62,6 +63,8 @@ def _take(address: str, folder: Path, seconds: float) -> None:
         }
         for page in pages.values():
             page.goto(address)
+            page.locator("#token").fill(token)
+            page.get_by_role("button", name="Open").click()
         light = pages["page_light"]
         light.wait_for_timeout(1000 * seconds)
         for name, page in pages.items():

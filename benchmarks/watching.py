@@ -15,6 +15,8 @@ import subprocess
 import tempfile
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from websockets.exceptions import WebSocketException
@@ -31,15 +33,15 @@ SETTINGS = ["--set", "training.stop_when_solved=false", "--env-steps", "10000000
 class Page:
     """A page that shows the run and the camera."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, token: str) -> None:
         self.frames, self._stop = 0, threading.Event()
-        self._address = address.replace("http", "ws") + "watch"
+        self._address, self._token = address.replace("http", "ws") + "watch", token
         self._thread = threading.Thread(target=self._watch)
         self._thread.start()
 
     def _watch(self) -> None:
         with open_socket(self._address, max_size=None) as socket:
-            socket.send(json.dumps({"type": "hello", "token": ""}))
+            socket.send(json.dumps({"type": "hello", "token": self._token}))
             socket.send(json.dumps({"type": "camera", "on": True}))
             while not self._stop.is_set():
                 try:
@@ -65,7 +67,8 @@ def main() -> None:
         run = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
         try:
             address = page_address(run)
-            _measure(address, learner_address(run.pid), parsed.rounds, parsed.seconds)
+            token = (Path(folder) / "run" / "operator-token").read_text().strip()
+            _measure(partial(Page, address, token), learner_address(run.pid), parsed.rounds, parsed.seconds)
         finally:
             run.terminate()
             run.wait()
@@ -81,7 +84,7 @@ def learner_address(launcher: int) -> str:
     raise SystemExit("the learner was not found")
 
 
-def _measure(page: str, learner: str, rounds: int, seconds: float) -> None:
+def _measure(show: Callable[[], Page], learner: str, rounds: int, seconds: float) -> None:
     transport = connect([learner])
     try:
         time.sleep(seconds)  # of the first updates
@@ -89,7 +92,7 @@ def _measure(page: str, learner: str, rounds: int, seconds: float) -> None:
         for number in range(rounds):
             rates = {}
             for watched in (number % 2 == 0, number % 2 == 1):
-                shown = Page(page) if watched else None
+                shown = show() if watched else None
                 time.sleep(3.0)  # for the camera to start, or to end
                 rates[watched] = _rate(transport, seconds)
                 if shown is not None:

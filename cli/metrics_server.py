@@ -4,7 +4,7 @@ import contextlib
 import socket
 import threading
 from socketserver import ThreadingMixIn
-from typing import Any
+from typing import Any, cast
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from prometheus_client import CollectorRegistry, make_wsgi_app
@@ -18,12 +18,20 @@ class _Handler(WSGIRequestHandler):
 
     timeout = _QUIET_SECONDS
 
+    def parse_request(self) -> bool:
+        """Note that the connection is not a silent one."""
+        cast(MetricsServer, self.server).asked(self.connection)
+        return super().parse_request()
+
     def log_message(self, format: str, *args: Any) -> None:
         """Log nothing."""
 
 
 class MetricsServer(ThreadingMixIn, WSGIServer):
-    """Server with a thread for each connection. Beyond the limit, the oldest connection is ended."""
+    """Server with a thread for each connection.
+
+    Beyond the limit, the oldest connection without a request is ended, and the oldest of all if each has one.
+    """
 
     daemon_threads = True
 
@@ -31,7 +39,7 @@ class MetricsServer(ThreadingMixIn, WSGIServer):
         """Listen. `serve_forever` serves until `shutdown`. Raises OSError."""
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         self.address_family = family
-        self._open: dict[socket.socket, None] = {}  # oldest first
+        self._open: dict[socket.socket, bool] = {}  # whether a request has come; oldest first
         self._lock = threading.Lock()
         super().__init__((str(address[0]), port), _Handler)
         self.set_app(make_wsgi_app(registry))
@@ -40,12 +48,18 @@ class MetricsServer(ThreadingMixIn, WSGIServer):
         """Serve a connection in a thread."""
         with self._lock:
             if len(self._open) >= _MAX_CONNECTIONS:
-                oldest = next(iter(self._open))
+                oldest = next((one for one, has_asked in self._open.items() if not has_asked), next(iter(self._open)))
                 del self._open[oldest]
                 with contextlib.suppress(OSError):  # it has ended
                     oldest.shutdown(socket.SHUT_RDWR)  # its thread notices, and closes it
-            self._open[request] = None
+            self._open[request] = False
         super().process_request(request, client_address)
+
+    def asked(self, connection: socket.socket) -> None:
+        """Note that a connection has sent a request."""
+        with self._lock:
+            if connection in self._open:
+                self._open[connection] = True
 
     def shutdown_request(self, request: Any) -> None:
         """Close a connection."""

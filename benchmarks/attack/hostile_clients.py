@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from benchmarks.attack.verdict import Verdict
 from benchmarks.chaos.scene import ENDLESS, scene
 
-_HELLO = {
+HELLO = {
     "type": "hello",
     "version": 1,
     "observations": {"observation": {"kind": "array", "shape": [4], "dtype": "float32"}},
@@ -40,10 +40,10 @@ def _messages() -> list[str | bytes]:
     act = {"type": "act", "observation": [0.0] * 4}
     return [
         "{", "[" * 200_000, "\x00" * 1000, b"\xc1" * 1000, b"\xdd\xff\xff\xff\xff", "null", '{"type":"act"}',
-        json.dumps({**_HELLO, "name": "x" * 200_000}),
-        json.dumps({**_HELLO, "name": "a", "observations": _HUGE}),
-        json.dumps({**_HELLO, "name": "b", "observations": {f"c{i}": _HUGE["observation"] for i in range(1000)}}),
-        json.dumps({**_HELLO, "name": "\x1b[2J<script>alert(1)</script>"}),
+        json.dumps({**HELLO, "name": "x" * 200_000}),
+        json.dumps({**HELLO, "name": "a", "observations": _HUGE}),
+        json.dumps({**HELLO, "name": "b", "observations": {f"c{i}": _HUGE["observation"] for i in range(1000)}}),
+        json.dumps({**HELLO, "name": "\x1b[2J<script>alert(1)</script>"}),
         json.dumps({**act, "observation": [1e999, 0, 0, 0]}),
         json.dumps({**act, "observation": [[0.0]] * 4}),
         json.dumps({**act, "reward": 10**400}),
@@ -91,7 +91,7 @@ def hostile_clients() -> Verdict:
 def play(port: int, until: float, steps: list[float]) -> None:
     """Be an honest client until a monotonic time; add the seconds of each step."""
     with connect(f"ws://127.0.0.1:{port}/actor") as client:
-        client.send(json.dumps({**_HELLO, "name": "honest"}))
+        client.send(json.dumps({**HELLO, "name": "honest"}))
         client.recv(timeout=60)
         while time.monotonic() < until:
             sent = time.monotonic()
@@ -111,7 +111,7 @@ def _attack(port: int, until: float, seed: int) -> None:
 def _attack_once(port: int, name: str, chosen: random.Random) -> None:
     with connect(f"ws://127.0.0.1:{port}/actor", open_timeout=5, close_timeout=1) as client:
         if chosen.random() < 0.7:
-            client.send(json.dumps({**_HELLO, "name": name}))
+            client.send(json.dumps({**HELLO, "name": name}))
             client.recv(timeout=5)
         for _ in range(chosen.randrange(20)):
             client.send(chosen.choice(_messages()))

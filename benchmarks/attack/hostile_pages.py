@@ -70,16 +70,16 @@ def _requests(port: int) -> list[bytes]:
 class _HonestPage:
     """A page that watches with the camera."""
 
-    def __init__(self, port: int, until: float) -> None:
+    def __init__(self, port: int, until: float, token: str) -> None:
         self.news = self.pictures = 0
         self.longest_silence = 0.0
-        self._port, self._until = port, until
+        self._port, self._until, self._token = port, until, token
         self.thread = threading.Thread(target=self._watch)
         self.thread.start()
 
     def _watch(self) -> None:
         with connect(f"ws://127.0.0.1:{self._port}/watch", max_size=None) as page:
-            page.send(_HELLO)
+            page.send(json.dumps({"type": "hello", "token": self._token}))
             page.send(json.dumps({"type": "camera", "on": True}))
             last = time.monotonic()
             while time.monotonic() < self._until:
@@ -109,7 +109,8 @@ def _attack_all(here: Scene) -> Verdict:
     honest = threading.Thread(target=play, args=(port, until, steps))
     honest.start()
     here.wait_for_training("honest")
-    page = _HonestPage(port, until)
+    token = (here.folder / "operator.token").read_text().strip()
+    page = _HonestPage(port, until, token)
     before = megabytes(gateway.process.pid)
     leaks: list[bytes] = []
     attackers = [
@@ -120,7 +121,7 @@ def _attack_all(here: Scene) -> Verdict:
         for thread in attackers:
             thread.start()
         for _ in range(_READERS_THAT_STALL):
-            stalled.enter_context(_stalled_page(port))
+            stalled.enter_context(_stalled_page(port, token))
         for thread in (*attackers, honest, page.thread):
             thread.join()
         grown = megabytes(gateway.process.pid) - before
@@ -143,10 +144,10 @@ def _attack_all(here: Scene) -> Verdict:
     )
 
 
-def _stalled_page(port: int) -> ClientConnection:
-    """Return a page that asks for everything and reads nothing."""
+def _stalled_page(port: int, token: str) -> ClientConnection:
+    """Return a page of the operator that asks for everything and reads nothing."""
     page = connect(f"ws://127.0.0.1:{port}/watch", max_queue=1, close_timeout=0.1)
-    page.send(_HELLO)
+    page.send(json.dumps({"type": "hello", "token": token}))
     page.send(json.dumps({"type": "camera", "on": True}))
     return page
 

@@ -5,6 +5,7 @@ import socket
 import sys
 import threading
 import urllib.request
+from typing import Any
 
 import pytest
 from processes import LIMIT, until
@@ -121,6 +122,42 @@ def test_silent_connections_keep_no_threads_and_nobody_out(monkeypatch: pytest.M
     server.shutdown()
     server.server_close()
     thread.join(LIMIT)
+
+
+def test_silent_connections_end_before_one_that_has_asked(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(metrics_server, "_MAX_CONNECTIONS", 3)
+    asked, answer = threading.Event(), threading.Event()
+
+    class SlowCollector:
+        def collect(self) -> list[Any]:
+            asked.set()
+            answer.wait(LIMIT)
+            return []
+
+    registry = CollectorRegistry()
+    server = metrics_server.MetricsServer("127.0.0.1", 0, registry)
+    registry.register(SlowCollector())
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    address = ("127.0.0.1", server.server_port)
+    with contextlib.ExitStack() as stack:
+        scrape = stack.enter_context(socket.create_connection(address, LIMIT))
+        scrape.sendall(b"GET /metrics?\xff=%ff HTTP/1.1\r\nHost: \xff\r\n\r\n")
+        assert asked.wait(LIMIT)
+        silent = [stack.enter_context(socket.create_connection(address, LIMIT)) for _ in range(8)]
+        assert all(one.recv(1) == b"" for one in silent[:6])
+        answer.set()
+        assert scrape.recv(65536).startswith(b"HTTP/1.0 200")
+        for odd in (b"GET /\xff HTTP/1.1\r\n\r\n", b"\xff\xfe\r\n\r\n"):
+            with socket.create_connection(address, LIMIT) as connection:
+                connection.sendall(odd)
+                connection.recv(1)
+    server.shutdown()
+    server.server_close()
+    thread.join(LIMIT)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_connection_that_says_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:

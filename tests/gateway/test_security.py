@@ -278,7 +278,7 @@ def test_of_silent_connections_the_oldest_give_way_and_clients_stay(
     network: MemoryNetwork, folder: Path, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch, secure: bool
 ) -> None:
     monkeypatch.setattr(server, "_REQUEST_SECONDS", 1e6)
-    monkeypatch.setattr(server, "most_connections", lambda: 6)
+    monkeypatch.setattr(server, "most_connections", lambda: 12)
     running = RunningGateway(network, folder / "gateway" if secure else None)
     try:
         connect = functools.partial(secure_client, running, folder) if secure else lambda: JsonClient(running.port)
@@ -296,7 +296,7 @@ def test_of_silent_connections_the_oldest_give_way_and_clients_stay(
 
 
 def test_address_with_the_most_silent_connections_gives_way_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "most_connections", lambda: 4)
+    monkeypatch.setattr(server, "most_connections", lambda: 16)
     crowd, given_way = server.Crowd(), list[str]()
 
     def add(name: str, address: str) -> server.Link:
@@ -310,11 +310,14 @@ def test_address_with_the_most_silent_connections_gives_way_first(monkeypatch: p
     crowd.settle(settled)
     add("attacker 2", "2001:db8::2")
     add("attacker 3", "2001:db8::ffff:3")  # an IPv6 network is one address
+    assert given_way == []
     add("attacker 4", "2001:db8::4")
-    assert given_way == ["attacker 1", "attacker 2"]
-    crowd.remove(settled)
     add("another", "10.0.0.3")
     assert given_way == ["attacker 1", "attacker 2"]
+    for _ in range(15):
+        crowd.settle(add("client", "10.0.0.2"))  # clients take the places of the silent, and never give way
+    assert "client" not in given_way
+    assert len(given_way) == 6
 
 
 def test_gateway_has_descriptors_left_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
