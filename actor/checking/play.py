@@ -29,7 +29,7 @@ from daedalus.actor.environments.masks import MASK_KEY, has_choices, mask_of_one
 from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line, place_of
-from daedalus.policy.user_modules import UserModules
+from daedalus.policy.user_modules import USER_STATE, UserModules
 from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -228,7 +228,8 @@ class _Play:
 
     def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
         try:
-            return getattr(self._environment, method)(*arguments, **keywords)
+            with USER_STATE:
+                return getattr(self._environment, method)(*arguments, **keywords)
         except EnvironmentSetupError:  # of a vector environment, or of the transforms
             raise
         except (Exception, SystemExit) as error:  # of the user's code
