@@ -6,15 +6,19 @@ of this process allows it.
 
 import importlib
 import os
+import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+import numpy as np
 
 
 class UserModuleError(Exception):
@@ -67,7 +71,7 @@ class UserModules:
         if name == "__main__":
             raise UserModuleError(f"{setting}={value}: name the module of the file, without .py, in place of __main__")
         try:
-            with _imported(name):
+            with _imported(name), USER_STATE.undone():
                 return importlib.import_module(name)
         except ImportError as error:
             raise UserModuleError(f"{setting}={value}: {_import_failure(name, error)}") from error
@@ -89,6 +93,102 @@ class UserModules:
 
 
 NO_MODULES = UserModules()
+
+
+class UserState:
+    """What of the interpreter's state code of the user has changed, kept apart from ours.
+
+    Enter it around such code. The code has what it set itself: numpy's handling of floating-point errors, the filters
+    of warnings, the standard streams. Outside it is as before: a cast of ours must not raise because an environment
+    called `np.seterr(all="raise")`, nor a result be printed to a stream that it put in place. What an import or a
+    constructor changes besides, of the recursion limit, torch's defaults and the handlers of SIGINT and SIGTERM, is
+    undone: a process must stop, and networks are float32.
+    """
+
+    def __init__(self) -> None:
+        self._ours: tuple[Any, ...] = ()  # while code of the user runs
+        self._theirs: tuple[Any, ...] | None = None  # if it differs
+        self._depth = 0
+
+    @property
+    def differs(self) -> bool:
+        """Whether code of the user has changed anything that it keeps."""
+        return self._theirs is not None
+
+    def __enter__(self) -> None:
+        self._depth += 1
+        if self._depth == 1:
+            self._ours = _kept_state()
+            if self._theirs is not None:
+                _restore(self._theirs, self._ours)
+
+    def __exit__(self, *_error: object) -> None:
+        self._depth -= 1
+        if not self._depth:
+            now = _kept_state()
+            self._theirs = None if now == self._ours else now
+            _restore(self._ours, now)
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Undo what a block changes that enters this state for each part of the user's code: the rest of it is ours."""
+        ours = _kept_state()
+        try:
+            yield
+        finally:
+            now = _kept_state()
+            if now != ours:
+                self._theirs = now
+                _restore(ours, now)
+
+    @contextmanager
+    def undone(self) -> Iterator[None]:
+        """Enter it for an import or a constructor."""
+        outer = self._depth == 0
+        before = _undone_state() if outer else ()
+        try:
+            with self:
+                yield
+        finally:
+            if outer:
+                _undo(before)
+
+
+def _kept_state() -> tuple[Any, ...]:
+    return np.geterr(), list(warnings.filters), sys.stdout, sys.stderr
+
+
+def _restore(state: tuple[Any, ...], now: tuple[Any, ...]) -> None:
+    """Set what differs from `now`."""
+    if state != now:
+        errors, filters, sys.stdout, sys.stderr = state
+        np.seterr(**errors)
+        warnings.resetwarnings()
+        warnings.filters[:] = filters  # pyright: ignore[reportIndexIssue]
+
+
+def _undone_state() -> tuple[Any, ...]:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    torch = sys.modules.get("torch")
+    return handlers, sys.getrecursionlimit(), torch and (torch.get_default_dtype(), torch.get_default_device())
+
+
+def _undo(before: tuple[Any, ...]) -> None:
+    (handlers, limit, defaults), now = before, _undone_state()
+    if threading.current_thread() is threading.main_thread():
+        for number, handler in handlers.items():
+            if handler is not None and handler != now[0][number]:
+                signal.signal(number, handler)
+    if limit != now[1]:
+        sys.setrecursionlimit(limit)
+    if now[2] is not None and now[2] != defaults:
+        torch = sys.modules["torch"]
+        dtype, device = defaults or (torch.float32, None)
+        torch.set_default_dtype(dtype)
+        torch.set_default_device(None if device is None or device.type == "cpu" else device)
+
+
+USER_STATE = UserState()  # of this process: one thread runs code of the user
 _importing = threading.local()
 
 

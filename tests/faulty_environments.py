@@ -1,11 +1,13 @@
 """Environments that each break gymnasium's interface in one way."""
 
+import io
 import multiprocessing
 import os
 import signal
 import sys
 import threading
 import time
+import warnings
 from typing import Any
 
 import gymnasium
@@ -163,6 +165,24 @@ def _box(dtype: str) -> Box:
         return Box(-np.inf, np.inf, (1,), np.dtype(dtype).type)
     limits = np.iinfo(dtype)
     return Box(limits.min, limits.max, (1,), np.dtype(dtype).type)
+
+
+class Strict(Showing):
+    """Showing, which sets interpreter-wide state when it is made."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        np.seterr(all="raise")
+        warnings.simplefilter("error")
+        sys.stdout = io.StringIO()
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+    def step(self, action: Any) -> Any:
+        assert np.geterr()["over"] == "raise"  # it has what it set
+        return super().step(action)
+
+
+gymnasium.register("Strict-v0", Strict)
 
 
 class ShowingVector(gymnasium.vector.VectorEnv[Any, Any, Any]):

@@ -26,9 +26,10 @@ from daedalus.actor.environments.closing import limited_close
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, has_choices, mask_of_one
+from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line, place_of
-from daedalus.policy.user_modules import UserModules
+from daedalus.policy.user_modules import USER_STATE, UserModules
 from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -123,6 +124,7 @@ class _Play:
         self._name, self._spec, self._environment, self._texts = spec.id, spec, environment, texts
         self._observation_space = observation_space  # without what is left out
         self._transforms, self._random_actions = transforms, random_actions
+        self._precision = Precision(observation_space)
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
         self._warnings = {text: text for text in unsaved_statistics(environment)}  # the first of each kind
@@ -155,12 +157,13 @@ class _Play:
 
     def report(self) -> EnvironmentReport:
         """Return what was found."""
+        warnings = [*self._warnings.values(), *self._precision.warnings.values()]
         problems = [*self._problems, *([self._texts.problem] if self._texts.problem else [])]
         return EnvironmentReport(
             spaces=self._transforms.spaces,
             constant_texts=self._texts.constant,
             problems=tuple(f"environment {self._name}: {problem}" for problem in problems),
-            warnings=tuple(f"environment {self._name}: {warning}" for warning in self._warnings.values()),
+            warnings=tuple(f"environment {self._name}: {warning}" for warning in warnings),
             env_steps=self._env_steps,
             step_seconds=self._step_seconds / max(self._env_steps, 1),
             busy_share=min(self._busy_seconds / max(self._step_seconds, 1e-9), 1.0),
@@ -179,7 +182,7 @@ class _Play:
         self._add(reset_violations(self._observation_space, result))
         if self._resets == 1:
             self._batch("observation", self._environment.observation_space, result[0])
-        self._observe(result[0], result[1], over=False)
+        self._observe(result[0], result[1], over=False, starts=True)
 
     def _step(self) -> tuple[float, bool]:
         """Take one random step, and return its reward and whether the episode is over."""
@@ -194,6 +197,7 @@ class _Play:
         self._add(step_violations(self._observation_space, result))
         observation, reward, terminated, truncated, info = result
         self._add(learned_reward_violations(float(reward), self._spec))
+        self._precision.add_reward(reward)
         over = bool(terminated or truncated)
         self._observe(observation, info, over=over)
         return float(reward), over
@@ -210,20 +214,22 @@ class _Play:
                 f"{kind}_space have the shape and the dtype of its values"
             ) from None
 
-    def _observe(self, observation: Any, info: dict[str, Any], *, over: bool) -> None:
+    def _observe(self, observation: Any, info: dict[str, Any], *, over: bool, starts: bool = False) -> None:
         """Take the masks of the next action. Raise _ProblemError if the run could not use the observation or them."""
         self._texts.add(observation)
         try:
             observed = self._transforms.observe_one(observation, info.get(MASK_KEY), needed=not over)
         except ValueError as error:
             raise _ProblemError(str(error)) from None
+        self._precision.add(observation, starts=starts)
         self._masks = observed.masks
         for name, largest in self._pixel_maxima.items():
             self._pixel_maxima[name] = max(largest, int(observed.frames[name].max()))
 
     def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
         try:
-            return getattr(self._environment, method)(*arguments, **keywords)
+            with USER_STATE:
+                return getattr(self._environment, method)(*arguments, **keywords)
         except EnvironmentSetupError:  # of a vector environment, or of the transforms
             raise
         except (Exception, SystemExit) as error:  # of the user's code

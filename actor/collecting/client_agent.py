@@ -1,12 +1,20 @@
 """One agent of a loop that the caller owns: its rows, written as the loop reports observations and rewards."""
 
+import logging
 from collections.abc import Callable
 from typing import Any
+
+import gymnasium
 
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
 from daedalus.actor.collecting.client_rows import ClientRows, finished_copy
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.environments.precision import Precision
+
+_logger = logging.getLogger(__name__)
+
+_MOST_WATCHED = 1000  # observations
 
 
 class ClientAgent:
@@ -31,6 +39,22 @@ class ClientAgent:
         self._rows: ClientRows | None = None
         self._loaded: LoadedPolicy | None = None  # that acts
         self.overridden_actions = self.safe_actions = 0
+        self._precision: Precision | None = None  # of the first observations
+        self._watched, self._warned = 0, set[str]()
+
+    def watch(self, space: gymnasium.Space) -> None:
+        """Warn of what float32 loses of the next observations, of which a space has the components that are read."""
+        self._precision, self._watched = Precision(space), 0
+
+    def _warn_of_losses(self, observation: Any) -> None:
+        if self._precision is None or self._watched >= _MOST_WATCHED:
+            return
+        self._watched += 1
+        self._precision.add(observation)
+        for name, text in self._precision.warnings.items():
+            if name not in self._warned:
+                self._warned.add(name)
+                _logger.warning("%s", text)
 
     def act(self, observation: Any, action_mask: Any = None, *, override: Any = None) -> Any:
         """Return the action to take now. After the end of the run it is the last policy's, and nobody learns from it.
@@ -49,6 +73,7 @@ class ClientAgent:
         rows = self._rows
         assert rows is not None  # a Client waits for the first policy
         rows.observe(observation, action_mask)
+        self._warn_of_losses(observation)
         while True:
             if rows.is_between_rollouts:
                 self._load_newest(rows)

@@ -13,6 +13,7 @@ from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPoli
 from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
@@ -73,6 +74,8 @@ class ClientCollector:
         check_run(spec)
         example = None if self._example_mask is None else mask_of_one(self._example_mask)
         self._transforms = Transforms(spec.environment, self._observation_space, self._action_space, example)
+        for agent in self.agents:
+            agent.watch(without(self._observation_space, spec.environment.leave_out))
         return self._transforms.spaces, len(self.agents) if spec.algorithm.synchronous else 1
 
     def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:

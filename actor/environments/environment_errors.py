@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from pydantic import ValidationError
 
 from daedalus.policy.user_code import first_line, frames_of, is_of_user, place_of
-from daedalus.policy.user_modules import file_of, hidden_file
+from daedalus.policy.user_modules import USER_STATE, file_of, hidden_file
 
 _logger = logging.getLogger(__name__)
 
@@ -114,7 +114,8 @@ def creation_errors(environment: str, hint: str = "") -> Iterator[None]:
     An EnvironmentSetupError passes as it is.
     """
     try:
-        yield
+        with USER_STATE.undone():
+            yield
     except EnvironmentSetupError:
         raise
     except gymnasium.error.DependencyNotInstalled as error:

@@ -1,8 +1,8 @@
 """Environments of a gymnasium vector environment, as the actor steps them."""
 
 import logging
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import gymnasium
@@ -18,6 +18,7 @@ from daedalus.actor.environments.interface import BackendStep
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 from daedalus.policy.user_code import first_line, place_of
+from daedalus.policy.user_modules import USER_STATE
 
 _logger = logging.getLogger(__name__)
 
@@ -45,6 +46,11 @@ class GymnasiumEnvironments:
         self.action_space: gymnasium.Space = environment.single_action_space
         self._read_space = without(self.observation_space, leave_out)
         self._episode_info = EpisodeInfo()
+        # Environments that gymnasium steps one by one enter it themselves, so that the batch is made under ours.
+        one_by_one = isinstance(environment, SyncVectorEnv | EnvironmentProcesses)
+        self._user_state: Callable[[], AbstractContextManager[None]] = (
+            USER_STATE.watched if one_by_one else lambda: USER_STATE
+        )
         self.action_mask: Any = None
         if not has_choices:
             return
@@ -56,7 +62,8 @@ class GymnasiumEnvironments:
     def reset(self, seed: int) -> Any:
         """See BackendEnvironments."""
         try:
-            observations, info = self._environment.reset(seed=seed)
+            with self._user_state():
+                observations, info = self._environment.reset(seed=seed)
         except EnvironmentSetupError:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
@@ -67,7 +74,8 @@ class GymnasiumEnvironments:
     def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments."""
         try:
-            observations, rewards, terminated, truncated, info = self._environment.step(actions)
+            with self._user_state():
+                observations, rewards, terminated, truncated, info = self._environment.step(actions)
         except EnvironmentSetupError:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
@@ -134,7 +142,7 @@ class GymnasiumEnvironments:
         """See BackendEnvironments. An exception of an environment is only logged: it has done its work."""
         try:
             # Environments in processes have a limit of their own, which ends these.
-            with nullcontext() if isinstance(self._environment, EnvironmentProcesses) else limited_close():
+            with USER_STATE, nullcontext() if isinstance(self._environment, EnvironmentProcesses) else limited_close():
                 self._environment.close()
         except (Exception, SystemExit) as error:  # of the user's code
             _logger.warning("environment %s: close raises %s%s", self._name, first_line(error), place_of(error))

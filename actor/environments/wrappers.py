@@ -15,6 +15,7 @@ from daedalus.actor.environments.leaves import leaves, without
 from daedalus.actor.environments.masks import MASK_KEY
 from daedalus.actor.environments.rendering import CountedSteps, FrameRate, frame_rate
 from daedalus.policy.user_code import first_line, place_of
+from daedalus.policy.user_modules import USER_STATE
 
 Camera = Callable[[np.ndarray, FrameRate], None]
 
@@ -66,13 +67,18 @@ class OfItsSpace(gymnasium.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See gymnasium.Env. Raises EnvironmentSetupError, as `step`."""
-        observation, info = self.env.reset(seed=seed, options=options)
+        with USER_STATE:
+            observation, info = self.env.reset(seed=seed, options=options)
         self._check("reset", observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """See gymnasium.Env."""
-        result = self.env.step(action)
+        if USER_STATE.differs:  # to enter it takes longer than some environments' steps
+            with USER_STATE:
+                result = self.env.step(action)
+        else:
+            result = self.env.step(action)
         self._check("step", result[0])
         return result
 

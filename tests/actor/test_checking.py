@@ -1,5 +1,6 @@
 """actor/checking: what is found in environments with faults, and in good ones."""
 
+import re
 from typing import Any, Literal
 
 import gymnasium
@@ -25,6 +26,7 @@ from daedalus.actor.checking.report import (
 )
 from daedalus.actor.checking.statistics import unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
+from daedalus.actor.environments.precision import Precision
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -398,3 +400,69 @@ def test_bounds_that_say_nothing_about_useful_actions_are_noted(
     assert advice == "" if not noted else f"action 'action' {noted}" in advice
     assert not uninformative_bounds(EnvironmentReport(spaces=spaces))
     assert not uninformative_bounds(EnvironmentReport())
+
+
+# ------------------------------------------------------------------------------------- what float32 cannot hold
+
+
+def precision_warnings(shown: list[Any], space: str, **kwargs: Any) -> tuple[str, ...]:
+    spec = EnvironmentSpec(id="faulty_environments:Showing-v0", kwargs={"shown": shown, "space": space, **kwargs})
+    modules = UserModules(frozenset({"faulty_environments"}))
+    report = check_environment(spec, modules, seconds=60.0, env_steps=len(shown) - 1)
+    assert report.problems == ()
+    return tuple(warning for warning in report.warnings if "float32" in warning)
+
+
+@pytest.mark.parametrize(
+    ("shown", "space", "reason"),
+    [
+        (
+            [1_700_000_000, 1_700_000_001],
+            "int64",
+            "has the value 1,700,000,001, which becomes 1,700,000,000 in float32",
+        ),
+        ([1_700_000_000, 1_700_000_001], "float64", "has the value 1,700,000,001, which becomes 1,700,000,000"),
+        ([0, 16_777_217], "int32", "has the value 16,777,217, which becomes 16,777,216"),
+        ([0, 4_000_000_001], "uint32", "has the value 4,000,000,001"),
+        ([1.7e9 + 0.1 * step for step in range(9)], "float64", "changes by about 0.1, but .* are 128 apart"),
+        ([5_800_000.2 + 0.03 * step for step in range(9)], "float64", "changes by about 0.03, but .* are 0.5 apart"),
+        ([52.52 + 1e-7 * step for step in range(9)], "float64", "changes by about 1e-07, but .* are 3.81e-06 apart"),
+    ],
+)
+def test_numbers_that_float32_merges_are_a_warning(shown: list[Any], space: str, reason: str) -> None:
+    (warning,) = precision_warnings(shown, space)
+    assert re.search(f"observation component 'observation' .*{reason}.*: in a wrapper", warning)
+
+
+def test_rewards_that_float32_merges_are_a_warning() -> None:
+    (warning,) = precision_warnings([0.0] * 3, "float64", rewards=[0, 1e8 + 1, 1e8 + 2])
+    assert "the reward has the value 100,000,001, which becomes 100,000,000 in float32" in warning
+
+
+@pytest.mark.parametrize(
+    ("shown", "space"),
+    [
+        ([16_777_216, 5, -3], "int64"),
+        ([0.1 * step for step in range(9)], "float64"),
+        ([1e6 + 10.3 * step for step in range(9)], "float64"),
+        ([9.81] * 9, "float64"),
+        ([9.81 * (1 + 2e-16 * step) for step in range(9)], "float64"),  # its own rounding
+    ],
+)
+def test_numbers_that_float32_tells_apart_are_no_warning(shown: list[Any], space: str) -> None:
+    assert precision_warnings(shown, space) == ()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "dtype", "warns"),
+    [
+        (1_600_000_000, 1_800_000_000, np.int64, True),
+        (0, 2**31 - 1, np.int32, False),  # what is usual there is not known
+        (1.7e9, 1.7e9 + 3600, np.float64, True),
+        (5_800_000.0, 5_900_000.0, np.float64, False),
+        (-np.inf, np.inf, np.float64, False),
+    ],
+)
+def test_bounds_between_which_float32_is_coarse_are_a_warning(low: Any, high: Any, dtype: Any, warns: bool) -> None:
+    warnings = Precision(gymnasium.spaces.Dict({"t": gymnasium.spaces.Box(low, high, (2,), dtype)})).warnings
+    assert list(warnings) == (["t"] if warns else [])

@@ -2,6 +2,9 @@
 
 import copy
 import itertools
+import signal
+import sys
+import warnings
 from typing import Any
 from unittest import mock
 
@@ -17,7 +20,7 @@ from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import Observed, Step
 from daedalus.policy.acting.noise import Noise
-from daedalus.policy.user_modules import UserModules
+from daedalus.policy.user_modules import USER_STATE, UserModules
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec
 from daedalus.protocol.uploads import Rollout
 
@@ -439,3 +442,19 @@ def test_an_episode_that_ends_in_a_step_that_only_resets_is_refused() -> None:
     collector = started_collector(_showing_vector("flags"), PlainPolicy(), rollout_length=9, modules=modules)
     with pytest.raises(EnvironmentSetupError, match="environment 0 ends an episode in the step after an episode's end"):
         collect(collector)
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_state_of_the_interpreter_that_an_environment_sets_is_its_own(
+    processes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """1e-42 and 1e300 make a cast to float32 raise under `np.seterr(all="raise")`."""
+    monkeypatch.setattr(USER_STATE, "_theirs", None)  # for the next tests, too
+    before = np.geterr(), list(warnings.filters), sys.stdout, signal.getsignal(signal.SIGTERM)
+    kwargs = {"shown": [0, 1e-42, 1e300, 1.0, 0], "space": "float64"}
+    spec = EnvironmentSpec(id="faulty_environments:Strict-v0", kwargs=kwargs, processes=processes)
+    modules = UserModules(frozenset({"faulty_environments"}))
+    collector = started_collector(spec, PlainPolicy(), count=2, rollout_length=4, modules=modules)
+    assert collect(collector).frames["observation"][:, 0, 0].tolist() == pytest.approx([0, 0, np.inf, 1.0, 0])
+    collector.close()
+    assert (np.geterr(), list(warnings.filters), sys.stdout, signal.getsignal(signal.SIGTERM)) == before

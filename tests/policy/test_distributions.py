@@ -13,6 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch import distributions as reference
 
+from daedalus.policy.acting.noise import draw_noise
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
 from daedalus.policy.network.distributions.distribution import Distribution
@@ -148,6 +151,25 @@ def test_squashed_gaussian_is_that_of_torch() -> None:
     expected = reference.TransformedDistribution(plain, [reference.TanhTransform()])
     actions = family.sample(mean, torch.zeros(50, 0), torch.randn(50, 3))
     torch.testing.assert_close(family.log_prob(mean, actions), expected.log_prob(actions).sum(-1), atol=2e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("std", [0.05, 0.3])
+@pytest.mark.parametrize("mean", [3.0, 7.25, 14.5, 1e4, -14.5])
+def test_recorded_density_of_a_squashed_gaussian_is_that_of_its_samples(mean: float, std: float) -> None:
+    """Beyond +-7.25 all samples are the same number in float32; the density of the tanh's argument is in float64."""
+    family = SquashedGaussian(ContinuousSpace(low=(-1.0,), high=(1.0,)), initial_std=std, state_dependent=False)
+    parameters, none = torch.full((2000, 1), mean), torch.zeros(2000, 0)
+    normal = torch.randn(2000, 1, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        recorded = family.log_prob(parameters, family.sample(parameters, none, normal)).double()
+        greedy = float(family.sample(parameters[:1], none[:1], torch.zeros(1, 1)))
+    beyond = max(abs(mean) - 4, 0)
+    limited = math.copysign(min(abs(mean), 4) + beyond / (1 + beyond / 2), mean)
+    argument = limited + std * normal[:, 0].double()
+    slope = 2 * (math.log(2) - argument - torch.nn.functional.softplus(-2 * argument))  # log(1 - tanh^2)
+    expected = reference.Normal(torch.tensor(limited).double(), std).log_prob(argument) - slope
+    assert (recorded - expected).abs().max() < 0.2
+    assert greedy == pytest.approx(math.tanh(mean), abs=1e-4)  # policies that were trained without the limit
 
 
 def test_mixture_is_that_of_torch() -> None:
@@ -397,3 +419,24 @@ def test_fault_of_an_own_distribution_is_one_line(
     with pytest.raises(NetworkError, match=f"^policy.distribution=mine_distribution:Own.*{message}") as caught:
         own_distribution(tmp_path, monkeypatch, **parts)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["gaussian", "squashed_gaussian", "gaussian_mixture", "kumaraswamy"])
+def test_extreme_parameters_have_the_same_log_probability_for_actor_and_learner(name: str) -> None:
+    """Of the same stored actions: the ratio of both policies must be 1 before an update."""
+    spaces = Spaces(observations={"observation": ArraySpace(shape=(1,), dtype="float32")}, actions={"action": BOX})
+    network = ActorCritic(PolicySpec(hidden=(), distribution=name), spaces)  # pyright: ignore[reportArgumentType]
+    runtime, rows = OnnxRuntime(export_program(network, spaces)), 64
+    observations = {"observation": np.zeros((rows, 1), np.float32)}
+    for scale in (1.0, 8.0, 60.0, 1e4):
+        head = scale * torch.randn(network.policy_head.bias.shape, generator=torch.Generator().manual_seed(3))
+        network.policy_head.bias.data.copy_(head)
+        runtime.load({key: value.detach().numpy() for key, value in network.named_parameters()})
+        noise = draw_noise(runtime.noise_size, rows, np.random.default_rng(1))
+        choice = runtime.act(observations, np.zeros((rows, 0), np.float32), noise, {})
+        with torch.no_grad():
+            learned = network.distribution.log_prob(
+                head.expand(rows, -1), {"action": torch.from_numpy(choice.actions["action"])}, {}
+            )
+        assert np.isfinite(choice.log_probs).all()
+        np.testing.assert_allclose(choice.log_probs, learned, rtol=1e-4, atol=2e-2)

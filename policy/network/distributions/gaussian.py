@@ -13,6 +13,7 @@ from daedalus.protocol.spaces import ContinuousSpace
 _LOG_STD_RANGE = (-5.0, 2.0)  # keeps densities and gradients finite
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 _LARGEST = 1.0 - 1e-6  # a squashed action is at most so far from 0: beyond it float32 has too few digits left
+_FREE_MEAN, _LARGEST_MEAN = 4.0, 6.0  # of a squashed action: means up to the first are as the head computes them
 _QUADRATURE_POINTS = 16
 
 
@@ -56,7 +57,12 @@ class Gaussian(Distribution):
 
 
 class SquashedGaussian(Gaussian):
-    """tanh of a Gaussian: actions never leave their bounds (Haarnoja et al. 2018, appendix C)."""
+    """tanh of a Gaussian: actions never leave their bounds (Haarnoja et al. 2018, appendix C).
+
+    The means of the Gaussian approach +-6 beyond +-4, where an action is within 1e-3 of its bound. Samples around a
+    larger mean would all be the largest action that float32 can tell from the bound, artanh(1 - 1e-6) = 7.25, whose
+    density under that Gaussian is next to nothing although it is nearly always taken.
+    """
 
     def sample(self, parameters: Tensor, uniform: Tensor, normal: Tensor) -> Tensor:
         """See Distribution: tanh(mu + sigma * normal)."""
@@ -79,6 +85,13 @@ class SquashedGaussian(Gaussian):
     def log_prob_and_entropy(self, parameters: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """See Distribution."""
         return self.log_prob(parameters, actions), self.entropy(parameters)
+
+    def _mean_and_log_std(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_std = super()._mean_and_log_std(parameters)
+        inner = mean.clamp(-_FREE_MEAN, _FREE_MEAN)
+        beyond = mean - inner
+        # Not by tanh, whose gradient vanishes: a mean that is far beyond must come back.
+        return inner + beyond / (1.0 + beyond.abs() / (_LARGEST_MEAN - _FREE_MEAN)), log_std
 
 
 def _log_density(mean: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:
