@@ -65,7 +65,7 @@ def set_aside_newer(run_directory: Path, policy_version: int) -> list[Path]:
         if _score_and_version(checkpoint)[1] > policy_version:
             aside = checkpoint.with_name(f"undone_{checkpoint.name}")
             if aside.exists():
-                shutil.rmtree(aside)
+                remove_sealed(aside)
             renamed.append(checkpoint.rename(aside))
     return renamed
 
