@@ -47,13 +47,13 @@ class LearnerSource:
                 return report
         return None
 
-    def order(self, status: RunStatus, order: Order) -> str:
+    def order(self, status: RunStatus, order: Order) -> tuple[bool, str]:
         """See RunSource."""
         request = encode(OrderRequest(order=order))
         for answer in self._transport.query(keys.orders(status.run), request, timeout=_ANSWER_SECONDS):
             match decode(answer, ACKNOWLEDGEMENT_LIMITS):
-                case Acknowledgement(verdict="accepted"):
-                    return ""
+                case Acknowledgement(verdict="accepted", reason=result):
+                    return True, result
                 case Refusal(reason=reason):
-                    return reason
-        return "the learner does not answer: try again later"
+                    return False, reason
+        return False, "the learner does not answer: try again later"

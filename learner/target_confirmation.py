@@ -50,8 +50,8 @@ class TargetConfirmation:
         If they do not, the newest returns are forgotten: the target has to be reached again. If the episodes cannot be
         played, or nothing can be written to the disk, the target counts as reached without them.
         """
-        if checkpointer.save() is None:
-            return True
+        if not checkpointer.wait(checkpointer.begin(), self._stop, self._beat, patient=False):
+            return not self._stop.is_set()  # when a stopped run is resumed, it asks again
         training = self._state.spec.training
         episodes = f"{training.target_episodes} new episodes"
         text = f"target {training.target_return:g} reached: the policy of this moment plays {episodes} to confirm it"

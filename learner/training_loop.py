@@ -78,9 +78,10 @@ class TrainingLoop:
             if now >= log_at:
                 records.record(self._learner, now)
                 log_at = now + service.log_seconds
-            if now >= save_at or self._orders.take_checkpoint():
-                self._checkpointer.save()
-                save_at = time.monotonic() + service.checkpoint_seconds
+            if (now >= save_at or self._orders.checkpoint_wanted) and self._checkpointer.idle:
+                answer = self._orders.take_checkpoint()
+                self._checkpointer.begin(on_end=lambda saving, answer=answer: answer(saving.is_saved, saving.result))
+                save_at = now + service.checkpoint_seconds
         return time.monotonic()
 
     def _reaches_target(self) -> bool:

@@ -69,13 +69,17 @@ def checkpoints(run_directory: Path) -> list[Path]:
 def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     """Return the policy of a checkpoint, or the best policy of a run directory.
 
-    The newest policy of the run is returned if no checkpoint has a score or `newest` is true. Damaged checkpoints are
-    logged and skipped. Raises NoPolicyError if there is no checkpoint, DamagedError if none is readable,
-    OtherFormatError for a run of another release.
+    The best is that with the highest score of an evaluation; if no checkpoint has one, that with the highest score of
+    training episodes. The newest policy of the run is returned if no checkpoint has a score or `newest` is true.
+    Damaged checkpoints are logged and skipped.
+
+    Raises NoPolicyError if there is no checkpoint, DamagedError if none is readable, OtherFormatError for a run of
+    another release.
     """
     if (directory / "manifest.json").exists():
         return read_policy(directory)
-    candidates = [*([] if newest else best_checkpoints(directory)), *checkpoints(directory)]
+    best = [] if newest else [*best_checkpoints(directory), *best_checkpoints(directory, training=True)]
+    candidates = [*best, *checkpoints(directory)]
     if not candidates:
         raise NoPolicyError(_no_checkpoints(directory))
     for candidate in candidates:
