@@ -1,5 +1,6 @@
 """A disk that becomes slow: every fsync of the learner takes seconds."""
 
+import re
 import tempfile
 import time
 from pathlib import Path
@@ -63,7 +64,7 @@ def _rate(here: Scene, window: float) -> tuple[float, float, set[str]]:
         if newest.updates != status.updates:
             changed = time.monotonic()
         gap = max(gap, time.monotonic() - changed)
-        problems |= {problem.rpartition(": ")[0] or problem for problem in newest.problems}
+        problems |= {re.sub(r"\d+ s", "N s", problem) for problem in newest.problems}
         status = newest
     assert first is not None
     assert status is not None

@@ -4,7 +4,14 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score, is_best, is_best_in_training, rescore
+from daedalus.policy.saving.best_checkpoints import (
+    best_checkpoints,
+    best_in_training,
+    best_score,
+    is_best,
+    is_best_in_training,
+    rescore,
+)
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError
 
@@ -28,11 +35,16 @@ class Candidate:
 def candidates(run_directory: Path) -> list[Candidate]:
     """Return the checkpoints with the best scores of evaluations and of training episodes, and the newest checkpoint.
 
-    Returns an empty list if no checkpoint has a score. Logs a warning for each damaged checkpoint.
+    Returns an empty list if no checkpoint has a score, and if nobody evaluated and the newest was the best in training:
+    there is nothing to select. Logs a warning for each damaged checkpoint.
     """
-    best = [*best_checkpoints(run_directory), *best_checkpoints(run_directory, training=True)]
+    evaluated, trained = best_checkpoints(run_directory), best_in_training(run_directory)
+    newest = checkpoints(run_directory)[:1]
+    if not evaluated and trained[:1] == newest:
+        return []
+    best = [*evaluated, *trained]
     found: dict[int, Candidate] = {}
-    for directory in [*best, *checkpoints(run_directory)[:1]] if best else []:
+    for directory in [*best, *newest] if best else []:
         try:
             version = read_policy(directory).policy_version
         except DamagedError as error:

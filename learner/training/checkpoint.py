@@ -19,7 +19,7 @@ import safetensors.torch
 from torch import Tensor
 
 from daedalus.learner.run.counters import check_counters
-from daedalus.policy.saving.best_checkpoints import TrainingScore
+from daedalus.policy.saving.best_checkpoints import TrainingScore, keep_if_best, training_score
 from daedalus.policy.saving.saved_policy import (
     FORMAT,
     PARAMETERS_FILE,
@@ -91,6 +91,8 @@ def save_checkpoint(
 ) -> Path:
     """Write a checkpoint, remove all others but the newest `keep` and `also_keep`, and return its directory.
 
+    Those that are among the best by their training episodes are kept under their score.
+
     Raises OSError on a disk error; the existing checkpoints then stay.
     """
     directory = checkpoint_path(run_directory, encoded.policy_version)
@@ -99,6 +101,12 @@ def save_checkpoint(
     others = [other for other in checkpoints(run_directory) if other != directory]
     for old in others[keep - 1 :]:
         if old not in also_keep:
+            try:
+                if (score := training_score(old)) is not None:
+                    keep_if_best(old, score, int(old.name), training=True)
+            except OSError as error:  # it is not removed: it may be the best
+                _logger.warning("%s cannot be kept under its score: %s", old, error.strerror or error)
+                continue
             shutil.rmtree(old, ignore_errors=True)
     for unfinished in directory.parent.glob(".*"):  # left by a crash, or set aside
         shutil.rmtree(unfinished, ignore_errors=True)

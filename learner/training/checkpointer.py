@@ -23,10 +23,9 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpoint import EncodedCheckpoint, encode_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
-from daedalus.policy.saving.best_checkpoints import TrainingScore, keep_if_best
+from daedalus.policy.saving.best_checkpoints import TrainingScore
 from daedalus.policy.saving.saved_policy import checkpoint_path
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.texts import short_number
 
 _logger = logging.getLogger(__name__)
 
@@ -122,7 +121,6 @@ class Checkpointer:
             try:
                 if again or self._newest != (saving.policy_version, directory) or not directory.exists():
                     self._save(saving, encoded, in_use)
-                    self._score(saving, score)
                 else:
                     saving.is_saved = True
             finally:
@@ -227,17 +225,6 @@ class Checkpointer:
         self._events.add("checkpoint", text, level=level)
         self._health.saved, self._health.save_fault = time.monotonic(), ""
         self._newest, self._env_steps = (saving.policy_version, saving.directory), saving.env_steps
-
-    def _score(self, saving: Saving, score: TrainingScore | None) -> None:
-        """Keep a saved checkpoint if its training episodes are among the best, where nobody evaluates."""
-        if score is None or not saving.is_saved:
-            return
-        mean = short_number(score.return_mean)
-        try:
-            if keep_if_best(saving.directory, score.return_mean, saving.policy_version, training=True):
-                _logger.info("the best so far: return %s, the mean of %s", mean, score.of)
-        except OSError as error:
-            _logger.warning("the best so far was not kept: %s", error.strerror or error)
 
     def _restore_config(self) -> None:
         """Write config.toml again, without which nobody can resume the run. Raises OSError."""

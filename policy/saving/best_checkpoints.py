@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daedalus.policy.saving.sealed import link_sealed
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, link_sealed
 
 _BEST = re.compile(r"best_(training_)?(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)_(\d{10,})", re.ASCII)
 _KEPT = 3  # of each kind. Scores over few episodes are noisy: with several, the best can be selected over more episodes
@@ -64,11 +64,35 @@ def best_score(directory: Path) -> float:
     return _score_and_version(directory)[0]
 
 
-def best_checkpoints(run_directory: Path, *, training: bool = False) -> list[Path]:
-    """Return the checkpoints of a run that have an evaluation's score, best first; of equal scores the newest first.
+def best_checkpoints(run_directory: Path) -> list[Path]:
+    """Return the checkpoints of a run that have an evaluation's score, best first; of equal scores the newest first."""
+    return _named(run_directory, training=False)
 
-    With `training`, return those with a score of training episodes.
+
+def best_in_training(run_directory: Path) -> list[Path]:
+    """Return the three best checkpoints of a run by their training episodes, as `best_checkpoints` does.
+
+    They are those that were kept when they would have been pruned, and those that are not old enough for that.
     """
+    folder = run_directory / "checkpoints"
+    scored = {_score_and_version(each): each for each in _named(run_directory, training=True)}
+    for entry in folder.iterdir() if folder.is_dir() else ():
+        score = training_score(entry) if entry.name.isdigit() else None
+        if score is not None:
+            scored.setdefault((score, int(entry.name)), entry)
+    return [scored[key] for key in sorted(scored, reverse=True)[:_KEPT]]
+
+
+def training_score(checkpoint: Path) -> float | None:
+    """Return the score of training episodes in the manifest of a checkpoint; None without one, or if it is damaged."""
+    try:
+        score = float(SealedDirectory(checkpoint).content["score"]["return_mean"])
+    except (DamagedError, KeyError, TypeError, ValueError, OverflowError):
+        return None
+    return score if math.isfinite(score) else None
+
+
+def _named(run_directory: Path, *, training: bool) -> list[Path]:
     folder = run_directory / "checkpoints"
     entries = folder.iterdir() if folder.is_dir() else ()
     scored = [entry for entry in entries if is_best(entry) and is_best_in_training(entry) == training]
@@ -82,7 +106,7 @@ def keep_if_best(checkpoint: Path, score: float, policy_version: int, *, trainin
     Returns whether it is the best. Raises OSError if writing fails.
     """
     target = checkpoint.with_name(best_name(score, policy_version, training=training))
-    kept = best_checkpoints(checkpoint.parent.parent, training=training)
+    kept = _named(checkpoint.parent.parent, training=training)
     rank = sum(_score_and_version(other) > (score, policy_version) for other in kept)
     if rank >= _KEPT or any(_score_and_version(other)[1] == policy_version for other in kept):
         return False

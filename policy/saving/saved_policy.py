@@ -17,7 +17,7 @@ import safetensors.numpy
 from pydantic import Field, TypeAdapter
 
 from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
-from daedalus.policy.saving.best_checkpoints import best_checkpoints
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.spaces import Spaces
@@ -78,7 +78,7 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     """
     if (directory / "manifest.json").exists():
         return read_policy(directory)
-    best = [] if newest else [*best_checkpoints(directory), *best_checkpoints(directory, training=True)]
+    best = [] if newest else [*best_checkpoints(directory), *best_in_training(directory)]
     candidates = [*best, *checkpoints(directory)]
     if not candidates:
         raise NoPolicyError(_no_checkpoints(directory))

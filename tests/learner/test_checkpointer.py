@@ -13,6 +13,7 @@ from building import POLICY, SPACES, make_rollouts, run_spec
 from log_lines import LINES
 
 from daedalus.learner.run import health, run_directory
+from daedalus.learner.run.candidates import candidates
 from daedalus.learner.run.evaluations import Evaluated
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
@@ -20,7 +21,7 @@ from daedalus.learner.training import checkpointer as module
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest
 from daedalus.learner.training.checkpointer import Checkpointer, Saving
 from daedalus.learner.training.learner import Learner
-from daedalus.policy.saving.best_checkpoints import best_checkpoints
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training, keep_if_best
 from daedalus.policy.saving.saved_policy import checkpoints, find_policy, read_policy
 from daedalus.policy.saving.sealed import SealedDirectory
 from daedalus.protocol.spec import RunSpec, TrainingSpec
@@ -225,46 +226,51 @@ def test_problems_name_metrics_that_are_not_written() -> None:
 # ------------------------------------------------------------------------------------- the best, without evaluator
 
 
-def collapse(run: Run, *returns: float) -> list[Path]:
+def collapse(run: Run, *returns: float) -> list[str]:
     """Save a checkpoint after each window of training episodes with this mean return, and return the best."""
     for number, mean in enumerate(returns):
         run.train(number)
         run.state.counters.returns.extend([mean] * run.state.counters.target_episodes)
         run.save()
-    return best_checkpoints(run.directory, training=True)
+    return [each.name for each in best_in_training(run.directory)]
 
 
 def test_the_good_weights_of_a_run_that_collapses_without_evaluator_are_kept(run: Run) -> None:
-    best = collapse(run, 100.0, 480.0, 300.0, 490.0, *[9.0] * 8)
-    assert [each.name for each in best] == [
+    assert collapse(run, 100.0, 480.0, 300.0) == ["0000000002", "0000000003", "0000000001"]
+    assert find_policy(run.directory).policy_version == 2
+    assert [each.policy_version for each in candidates(run.directory)] == [2, 3, 1]
+    assert collapse(run, 490.0, *[9.0] * 8) == [
         "best_training_490.0_0000000004",
         "best_training_480.0_0000000002",
         "best_training_300.0_0000000003",
     ]
-    assert len(checkpoints(run.directory)) == 3
-    assert find_policy(run.directory).policy_version == 4
+    assert [each.name for each in checkpoints(run.directory)] == ["0000000012", "0000000011", "0000000010"]
+    assert len([*(run.directory / "checkpoints").iterdir()]) == 6
+    best = find_policy(run.directory)
+    assert best.policy_version == 4
     assert find_policy(run.directory, newest=True).policy_version == 12
-    assert SealedDirectory(best[0]).content["score"] == {
-        "return_mean": 490.0,
-        "episodes": 100,
-        "of": "the newest 100 training episodes",
-    }
+    of = "the newest 100 training episodes"
+    assert SealedDirectory(best.directory).content["score"] == {"return_mean": 490.0, "episodes": 100, "of": of}
+    assert [each.policy_version for each in candidates(run.directory)] == [4, 2, 3, 12]
+    keep_if_best(checkpoints(run.directory)[0], -5.0, 12)  # an evaluator has come: its score is not of the same kind
+    assert find_policy(run.directory).policy_version == 12
 
 
 def test_shaped_training_returns_are_called_so(tmp_path: Path) -> None:
     spec = run_spec()
     shaped = spec.environment.model_copy(update={"training_kwargs": {"bonus": 1.0}})
-    best = collapse(Run(tmp_path, spec.model_copy(update={"environment": shaped})), 5.0)
-    score = SealedDirectory(best[0]).content["score"]
+    run = Run(tmp_path, spec.model_copy(update={"environment": shaped}))
+    collapse(run, 5.0)
+    score = SealedDirectory(checkpoints(tmp_path)[0]).content["score"]
     assert score["of"] == "the newest 100 training episodes, with the rewards of environment.training_kwargs"
-    assert any(line.endswith(score["of"]) for line in LINES)
 
 
 def test_training_returns_of_too_few_episodes_or_of_an_evaluated_run_are_no_scores(run: Run) -> None:
     run.state.counters.returns.extend([500.0] * 99)
     run.save()
-    assert best_checkpoints(run.directory, training=True) == []
+    assert best_in_training(run.directory) == []
     run.state.evaluations.heard = module.time.monotonic()
     assert collapse(run, 500.0) == []
     run.state.evaluations.heard -= 601.0  # the evaluator was lost
     assert len(collapse(run, 500.0)) == 1
+    assert candidates(run.directory) == []  # the newest is the best
