@@ -22,7 +22,7 @@ class TrainingRun:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         """The run directory. `daedalus.load_policy(run.directory)` loads the best policy that was evaluated, or else
-        the newest; it raises NoPolicyError before the first checkpoint."""
+        the best by its training episodes, or else the newest; it raises NoPolicyError before the first checkpoint."""
         self.stop_reason: str | None = None
         """The reason given to `stop`, or None."""
         self._metrics: dict[str, float] = {}

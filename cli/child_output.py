@@ -4,6 +4,7 @@ The environments of a user may print at every step: this must neither flood the 
 """
 
 import os
+import queue
 import select
 import threading
 import time
@@ -27,6 +28,8 @@ _KEPT_LINES = 40
 _SHOWN_AT_END = 5  # error lines of a process that were not shown before: a traceback ends with what matters
 _REPETITION = 2  # a line that equals one of so many before it is not shown: a warning that every environment repeats
 _CLOSE_SECONDS = 5.0
+_WAITING_WRITES = 256  # for the log; each has at most 64 KiB
+_SLOW_SECONDS = 1.0  # in which a disk has taken one of them
 _POLL_SECONDS = 0.02
 
 
@@ -62,28 +65,57 @@ class RateLimit:
 
 
 class OutputLog:
-    """Log file of bounded size: when it is full it becomes FILE.1, which is replaced. A full disk is ignored."""
+    """Log file of bounded size: when it is full it becomes FILE.1, which is replaced. A full disk is ignored.
+
+    A thread writes, so that a disk that does not answer does not stop the processes, whose pipes would fill up. The
+    lines that it cannot take are left out, and the log says how many.
+    """
 
     def __init__(self, path: Path) -> None:
         """Create no file before the first line."""
         self._path, self._bytes = path, 0
         self._file: BinaryIO | None = None
+        self._waiting: queue.Queue[Sequence[bytes] | None] = queue.Queue(_WAITING_WRITES)
+        self._thread: threading.Thread | None = None
+        self._left_out = 0  # lines
 
     def write(self, lines: Sequence[bytes]) -> None:
-        """Append lines."""
-        with suppress(OSError):
-            if self._file is None:
-                self._file = append_own(self._path)
-                self._bytes = self._file.tell()
-            data = b"".join(lines)
-            self._file.write(data)
-            self._bytes += len(data)
-            if self._bytes > _LOG_BYTES:
-                self.close()
-                os.replace(self._path, self._path.with_name(f"{self._path.name}.1"))
+        """Append lines. For one caller at a time."""
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._work, name="output-log", daemon=True)
+            self._thread.start()
+        note = [f"{self._left_out:,} lines are left out: the disk was slow\n".encode()] if self._left_out else []
+        try:
+            self._waiting.put([*note, *lines], timeout=0.0 if note else _SLOW_SECONDS)
+            self._left_out = 0
+        except queue.Full:
+            self._left_out += len(lines)
 
     def close(self) -> None:
-        """Close the file; a further line opens it again."""
+        """Write what is left, and close the file, unless the disk does not answer; a further line opens it again."""
+        if self._thread is None:
+            return
+        with suppress(queue.Full):
+            self._waiting.put(None, timeout=_CLOSE_SECONDS)
+            self._thread.join(_CLOSE_SECONDS)
+
+    def _work(self) -> None:
+        while (lines := self._waiting.get()) is not None:
+            with suppress(OSError):
+                self._append(b"".join(lines))
+        self._close_file()
+
+    def _append(self, data: bytes) -> None:
+        if self._file is None:
+            self._file = append_own(self._path)
+            self._bytes = self._file.tell()
+        self._file.write(data)
+        self._bytes += len(data)
+        if self._bytes > _LOG_BYTES:
+            self._close_file()
+            os.replace(self._path, self._path.with_name(f"{self._path.name}.1"))
+
+    def _close_file(self) -> None:
         if self._file is not None:
             self._file.close()
         self._file = None

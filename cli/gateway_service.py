@@ -164,14 +164,14 @@ class GatewayService:
             if not self._stop.is_set():
                 self._loop.call_soon_threadsafe(self._data.show, seen)
 
-        def give(order: Order) -> str:
+        def give(order: Order) -> tuple[bool, str]:
             status = self._data.seen.status
             if status is None:
-                return "no learner has answered yet"
+                return False, "no learner has answered yet"
             try:
                 return source.order(status, order)
             except (TransportError, ProtocolError) as error:
-                return str(error)
+                return False, str(error)
 
         self._monitor = RunMonitor(source, show, lambda: gateway.run.last_end)
         gateway.run.on_change = self._monitor.look

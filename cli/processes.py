@@ -103,7 +103,7 @@ class _Stop(threading.Event):
         return found
 
 
-def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
+def stop_on_signals(*, exit_if_stuck: bool = False, stuck_seconds: float = _STUCK_SECONDS) -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
     The process can so close its resources before it ends. A thread sets the event, not the signal handlers. Python
@@ -111,7 +111,7 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     interrupt the main thread, or another handler, inside the event: it would wait for ever for the event's lock.
 
     With `exit_if_stuck`, the process ends with status 1 if the main thread does not check the event within
-    `_STUCK_SECONDS`, because a call such as a step of a simulator does not return, or does not end within
+    `stuck_seconds`, because a call such as a step of a simulator does not return, or does not end within
     `_END_SECONDS` more.
     """
     stop = _Stop()
@@ -133,7 +133,7 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
         os.register_at_fork(after_in_child=_default_signals)
     threading.Thread(target=watch, name="signals", daemon=True).start()
     if exit_if_stuck:
-        threading.Thread(target=_exit_if_stuck, args=(stop,), name="stuck-watch", daemon=True).start()
+        threading.Thread(target=_exit_if_stuck, args=(stop, stuck_seconds), name="stuck-watch", daemon=True).start()
     return stop
 
 
@@ -148,16 +148,19 @@ def _ignore(_number: int, _frame: object) -> None:
     """Handle a signal that a thread reads from the wakeup descriptor."""
 
 
-def _exit_if_stuck(stop: _Stop) -> None:
+def _exit_if_stuck(stop: _Stop, stuck_seconds: float) -> None:
     """Wait for `stop`, and end the process unless it ends by itself."""
     stop.wait()
-    if stop.noticed.wait(_STUCK_SECONDS):
+    if stop.noticed.wait(stuck_seconds):
         time.sleep(_END_SECONDS)
     _end_with(_say_stuck, within=_LAST_WORD_SECONDS)
 
 
 def _say_stuck() -> None:
-    _logger.error("asked to stop, but a call, such as a step of the environment, does not return: the process ends")
+    _logger.error(
+        "asked to stop, but a call, such as a step of the environment or a write to the disk, does not return: "
+        "the process ends"
+    )
     sys.stdout.flush()
 
 

@@ -47,12 +47,12 @@ class LearnerSource:
                 return report
         return None
 
-    def order(self, status: RunStatus, order: Order) -> str:
+    def order(self, status: RunStatus, order: Order) -> tuple[bool, str]:
         """See RunSource."""
         request = encode(OrderRequest(order=order))
         answers = self._transport.query(keys.orders(status.run), request, timeout=_ANSWER_SECONDS)
-        if decoded(answers, Acknowledgement, ACKNOWLEDGEMENT_LIMITS):
-            return ""
+        for accepted in decoded(answers, Acknowledgement, ACKNOWLEDGEMENT_LIMITS):
+            return True, accepted.reason
         for refusal in decoded(answers, Refusal, ACKNOWLEDGEMENT_LIMITS):
-            return refusal.reason
-        return "the learner does not answer: try again later"
+            return False, refusal.reason
+        return False, "the learner does not answer: try again later"

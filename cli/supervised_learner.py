@@ -11,7 +11,7 @@ from pathlib import Path
 from daedalus.cli.child_output import inherited
 from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import SUPERSEDED, UNSAVED
-from daedalus.cli.supervisor import FailedError, Supervised, start, stop
+from daedalus.cli.supervisor import LEARNER_GRACE_SECONDS, FailedError, Supervised, start, stop
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 
@@ -20,7 +20,6 @@ _logger = logging.getLogger(__name__)
 _POLL_SECONDS = 0.05
 _ENDED = {0, 3, UNSAVED, SUPERSEDED}  # exit statuses of a learner that is not restarted
 _FAILED = 1
-_END_SECONDS = 30.0  # for the learner to save its checkpoint on a busy machine: it ends its processes within 5 s itself
 
 
 def supervise_learner(directory: Path, arguments: argparse.Namespace, stopping: threading.Event) -> int:
@@ -56,7 +55,7 @@ def supervise_learner(directory: Path, arguments: argparse.Namespace, stopping: 
         print_error("learner", error)
         return _FAILED
     finally:
-        stop([learner.process], _END_SECONDS)
+        stop([learner.process], LEARNER_GRACE_SECONDS)
         if numbered:
             with suppress(OSError):  # not empty
                 directory.rmdir()
@@ -70,6 +69,6 @@ def _watched(learner: Supervised, stopping: threading.Event) -> int:
             return status
         if message := learner.check():
             _logger.warning("%s", message)
-    stop([learner.process], _END_SECONDS)
+    stop([learner.process], LEARNER_GRACE_SECONDS)
     status = learner.process.returncode
     return status if status >= 0 else _FAILED

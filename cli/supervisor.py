@@ -27,6 +27,7 @@ _SOON_SECONDS = 60.0  # a process that ran for longer before it ended starts a n
 _MOST_RESTARTS = 1000  # of one process that is killed from outside
 _LEAVING_SECONDS = 30.0  # between the end of the first process and the end of the others
 _GRACE_SECONDS = 4.0  # from SIGTERM to SIGKILL
+LEARNER_GRACE_SECONDS = 30.0  # the same for a learner: it waits for a slow disk, but not longer, and ends by itself
 
 _ACTOR_ERROR = "daedalus actor: "  # beginning of the line in which an actor reports its error
 

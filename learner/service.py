@@ -19,6 +19,7 @@ from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.run_records import RunRecords, continue_records
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
+from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.initial import other_network, other_spaces
 from daedalus.learner.run.rollout_length import check_rollout_length
@@ -144,6 +145,7 @@ class LearnerService:
         rollouts are too short for masked actions, RankLostError or RanksDisagreeError of the other processes of the
         learner.
         """
+        self._heartbeat.start()
         try:
             self._server.open()
             version = self._restored.policy.policy_version if self._restored is not None else 0
@@ -160,7 +162,7 @@ class LearnerService:
             self._load(learner, spaces)
             checkpointer, loop = self._training_of(learner, spaces)
             if self._initial is not None:
-                checkpointer.save()  # a learner that is killed before its first checkpoint continues from this one
+                checkpointer.begin()  # a learner that is killed before its first checkpoint continues from this one
             ranks.begin(spaces, learner.shared_state)
             if self._restored is None and not self._await_actor():
                 return self._stopped_without_actors()
@@ -255,10 +257,11 @@ class LearnerService:
         state, server = self._state, self._server
         if problem := unmeasured_target(self._spec):
             _logger.warning("%s", problem)
-        recorder = Recorder(self._open_writers, self._progress)
-        records = RunRecords(state, self._reporter, server.history, server.events, recorder)
+        event_file = EventFile(state.directory)
+        recorder = Recorder(self._open_writers, self._progress, lambda: event_file.add(server.events.take_new()))
+        records = RunRecords(state, self._reporter, server.history, recorder)
         self._reporter.begin(time.monotonic())
-        finished, saved, ended = False, None, None
+        finished, ended, saving = False, None, None
         try:
             ended = loop.run(records, resumed=self._restored is not None)
             finished = state.is_finished
@@ -269,21 +272,24 @@ class LearnerService:
             ended = ended or time.monotonic()
             try:
                 server.close(_FINISHED if finished else _STOPPED, finished=finished)
+                saving = checkpointer.begin(last=True)  # it is written while the last metrics are
                 records.record(learner, ended, last=True)
                 records.close()
             finally:
-                saved = checkpointer.save(last=True)
+                saving = saving or checkpointer.begin(last=True)
+                saved = checkpointer.wait(saving, self._stop, self._heartbeat.beat)
         confirmation = self._confirmation.result if self._confirmation is not None else None
-        records.write_summary(finished=finished, ended=ended, confirmation=confirmation)
+        if saving.done.is_set():  # else the disk does not answer
+            records.write_summary(finished=finished, ended=ended, confirmation=confirmation)
         env_steps = f"{state.counters.env_steps:,} env_steps"
         if finished:
             server.await_departures(self._stop)
-        elif saved is not None:
-            _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saved)
+        elif saved:
+            _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saving.directory)
         return Outcome(
             solved=state.counters.seconds_to_target is not None,
             finished=finished,
-            saved=saved is not None,
+            saved=saved,
             seconds_to_target=state.counters.seconds_to_target,
             ordered=self._orders.stopped,
             superseded_by=self._orders.superseded_by,

@@ -57,8 +57,8 @@ class TargetConfirmation:
         began = time.monotonic()
         if began < self._not_before:
             return False
-        if checkpointer.save() is None:
-            return True
+        if not checkpointer.wait(checkpointer.begin(), self._stop, self._beat, patient=False):
+            return not self._stop.is_set()  # when a stopped run is resumed, it asks again
         training = self._state.spec.training
         episodes = f"{training.target_episodes} new episodes"
         target = exact_number(training.target_return)

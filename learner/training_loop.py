@@ -82,10 +82,12 @@ class TrainingLoop:
             if now >= log_at:
                 records.record(self._learner, now)
                 log_at = now + service.log_seconds
-            if self._orders.take_checkpoint() or now >= save_at or self._learner.policy_version > soon_after:
-                self._checkpointer.save()
+            due = now >= save_at or self._orders.checkpoint_wanted or self._learner.policy_version > soon_after
+            if due and self._checkpointer.idle:
+                answer = self._orders.take_checkpoint()
+                self._checkpointer.begin(on_end=lambda saving, answer=answer: answer(saving.is_saved, saving.result))
                 soon_after = math.inf
-                save_at = time.monotonic() + service.checkpoint_seconds
+                save_at = now + service.checkpoint_seconds
         return time.monotonic()
 
     def _reaches_target(self) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from allowed_modules import TEST_MODULES
 
 from daedalus.actor.environments.make import make_environments
-from daedalus.learner.training.checkpoint import save_checkpoint
+from daedalus.learner.training.checkpoint import encode_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_name
 from daedalus.protocol.spaces import Spaces
@@ -43,8 +43,7 @@ def save(
     random = np.random.default_rng(weights_seed)
     weights = {name: random.standard_normal(array.shape, np.float32) for name, array in learner.weights().items()}
     for version in versions:
-        save_checkpoint(
-            run,
+        encoded = encode_checkpoint(
             spec=run_spec,
             spaces=spaces or made.spaces,
             policy_version=version,
@@ -52,12 +51,12 @@ def save(
             parameters=weights,
             state=learner.state(),
             counters={},
-            keep=9,
         )
+        save_checkpoint(run, encoded, keep=9)
     return run
 
 
-def score(run: Path, score: float, version: int) -> Path:
-    """Rename a checkpoint as an evaluation with this score does; return its folder."""
+def score(run: Path, score: float, version: int, *, training: bool = False) -> Path:
+    """Rename a checkpoint as an evaluation with this score does, or the `training` episodes; return its folder."""
     directory = run / "checkpoints" / f"{version:010d}"
-    return directory.rename(directory.with_name(best_name(score, version)))
+    return directory.rename(directory.with_name(best_name(score, version, training=training)))

@@ -30,6 +30,7 @@ class Worker:
         self.error: BaseException | None = None
         self._work = work
         self._thread = threading.Thread(target=self._run, daemon=True)
+        self.name = self._thread.name
         self._thread.start()
 
     def _run(self) -> None:

@@ -121,7 +121,8 @@ def load_policy(
     """Load the policy of a run, one that ships with the package, or one on the Hub.
 
     Args:
-      directory: a run directory, or one of its checkpoints; of a run the best checkpoint, else the newest.
+      directory: a run directory, or one of its checkpoints; of a run the best checkpoint by its evaluations, else by
+        its training episodes, else the newest.
       newest: load the newest checkpoint of the run, not the best.
       pretrained: the name of a policy that ships with the package, in place of a directory.
       from_hub: USER/NAME of a policy on the Hugging Face Hub that `daedalus push` uploaded, in place of a directory.

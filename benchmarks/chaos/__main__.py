@@ -9,7 +9,7 @@ import argparse
 import sys
 import time
 
-from benchmarks.chaos import actors, clocks, endings, learners, network, orders, wire
+from benchmarks.chaos import actors, clocks, disk, endings, learners, network, orders, wire
 from benchmarks.chaos.scene import FailedError, say
 from benchmarks.running import machine, table
 
@@ -37,6 +37,7 @@ def main() -> int:
         "routers": lambda: network.routers(scaled(20)),
         "cuts": lambda: network.cuts(30.0 if arguments.scale >= 1.0 else 8.0, scaled(2)),
         "orders": lambda: orders.orders(scaled(12)),
+        "disk": lambda: disk.slow(15.0, max(40.0 * arguments.scale, 20.0)),
         "checkpoints": lambda: learners.damaged(scaled(1000)),
         "overload": lambda: wire.overload(max(60.0 * arguments.scale, 10.0)),
         "subscriber": lambda: wire.slow_subscriber(max(20.0 * arguments.scale, 5.0)),

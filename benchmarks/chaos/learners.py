@@ -14,7 +14,7 @@ from processes import processes_mentioning
 
 from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scene, seconds
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.training.checkpoint import load_newest, save_checkpoint
+from daedalus.learner.training.checkpoint import encode_checkpoint, load_newest, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
@@ -177,8 +177,7 @@ def damaged(count: int) -> list[tuple[str, str]]:
         run = Path(folder) / "run"
 
         def save(version: int) -> Path:
-            return save_checkpoint(
-                run,
+            encoded = encode_checkpoint(
                 spec=spec,
                 spaces=spaces,
                 policy_version=version,
@@ -186,8 +185,8 @@ def damaged(count: int) -> list[tuple[str, str]]:
                 parameters=learner.weights(),
                 state=learner.state(),
                 counters=RunCounters(1).state(float(version)),
-                keep=2,
             )
+            return save_checkpoint(run, encoded, keep=2)
 
         save(1)
         newest = save(2)

@@ -27,7 +27,7 @@ from daedalus.cli.processes import (
     stop_on_signals,
 )
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
-from daedalus.policy.saving.best_checkpoints import is_best
+from daedalus.policy.saving.best_checkpoints import is_best, is_best_in_training
 from daedalus.policy.saving.hub import HubError, RepositoryNameError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from daedalus.policy.saving.sealed import DamagedError
@@ -248,6 +248,8 @@ def _note(evaluation: Evaluation, longest: int, *, sampled: bool) -> str:
 
 def _text(result: dict[str, Any]) -> str:
     best = "best checkpoint, " if result["best_checkpoint"] else ""
+    if is_best_in_training(Path(result["checkpoint"])):
+        best = "best checkpoint by its training episodes, "
     text = (
         f"{result['environment']} (backend {result['backend']}), {best}policy version {result['policy_version']}: "
         f"return {short_number(result['return_mean'])} +- {short_number(result['return_std'])} "

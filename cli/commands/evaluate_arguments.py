@@ -14,7 +14,8 @@ from daedalus.protocol.spec import Backend
 
 DESCRIPTION = """\
 Plays new episodes with the policy of a run and reports their returns, with unscaled rewards. By default it uses the
-best checkpoint of the run, or the newest if there is no best one. Name the folder of a checkpoint to use that one."""
+best checkpoint of the run: by the evaluations during training, or by its training episodes where there were none. If
+there is no best one, it uses the newest. Name the folder of a checkpoint to use that one."""
 
 EXAMPLES = """\
 examples:

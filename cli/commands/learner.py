@@ -79,6 +79,8 @@ _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it r
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
+_UPDATE_SECONDS = 120.0  # longer than one takes
+
 REACHED, NOT_REACHED = 0, 3
 _FAILURES = (
     AlgorithmError,
@@ -101,7 +103,8 @@ def main() -> int:
     here = surroundings.directory
     keep_freed_memory()
     raise_descriptor_limit()
-    stop = stop_on_signals()
+    # An update may take long. A disk that does not answer may hold this thread for ever.
+    stop = stop_on_signals(exit_if_stuck=True, stuck_seconds=_UPDATE_SECONDS)
     user_metrics = UserMetrics()
     if arguments.exit_with_parent:
         exit_with_parent(stop, user_metrics.add_line)

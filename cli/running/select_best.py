@@ -53,7 +53,9 @@ def select_best(
     scores = []
     for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
-        before = "" if candidate.score is None else f" ({short_number(candidate.score)} before)"
+        before = ""
+        if candidate.score is not None:
+            before = f" ({short_number(candidate.score)} {'in training' if candidate.of_training else 'before'})"
         _logger.info("  policy version %d: %s +- %s%s", version, short_number(mean), short_number(std), before)
         try:
             candidate.rescore(mean)

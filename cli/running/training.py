@@ -19,6 +19,7 @@ from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.running.local_run import LocalRun
 from daedalus.cli.supervisor import (
     GATEWAY,
+    LEARNER_GRACE_SECONDS,
     FailedError,
     Supervised,
     start,
@@ -83,7 +84,9 @@ def train(
             trackers.start()
             return watch(learner, [*actors, *page], run, stopping, confirmations)
         finally:
-            stop([learner.process, *(actor.process for actor in actors), *confirmations.processes])
+            learner.process.terminate()
+            stop([*(actor.process for actor in actors), *confirmations.processes])
+            stop([learner.process], LEARNER_GRACE_SECONDS)  # where the disk is slow, it takes longer than the others
             confirmations.close()
 
 

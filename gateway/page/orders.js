@@ -2,6 +2,7 @@
 
 import { byId, setText } from "./dom.js";
 
+// Where the learner does not say what came of an order.
 const DONE = { stop: "The learner saves a checkpoint and ends.", checkpoint: "The learner saves a checkpoint." };
 
 export class Orders {
@@ -25,8 +26,8 @@ export class Orders {
     byId("read-only").hidden = offered;
   }
 
-  done({ order }) {
-    this.#show(DONE[order]);
+  done({ order, result }) {
+    this.#show(result ? `Done: ${result}.` : DONE[order]);
   }
 
   refused({ reason }) {

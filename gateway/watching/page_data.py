@@ -12,7 +12,7 @@ from daedalus.protocol.orders import Order
 MAX_VIEWERS = 32
 _OPERATORS = 4  # further pages, for operators
 
-GiveOrder = Callable[[Order], str]  # waits for the learner; returns why it is not accepted, or an empty string
+GiveOrder = Callable[[Order], tuple[bool, str]]  # waits for the learner, as RunSource.order
 
 
 class Camera(Protocol):
@@ -23,8 +23,8 @@ class Camera(Protocol):
         ...
 
 
-def _nobody(order: Order) -> str:
-    return "the learner was not reached yet: try again later"
+def _nobody(order: Order) -> tuple[bool, str]:
+    return False, "the learner was not reached yet: try again later"
 
 
 class PageData:

@@ -26,8 +26,8 @@ class RunSource(Protocol):
         """Return the rows from number `first` on, as many as one answer has; None without an answer."""
         ...
 
-    def order(self, status: RunStatus, order: Order) -> str:
-        """Give an order; return why it is not accepted, or an empty string."""
+    def order(self, status: RunStatus, order: Order) -> tuple[bool, str]:
+        """Give an order; return whether it is accepted, and what came of it or why it is not."""
         ...
 
 

@@ -176,10 +176,10 @@ class ViewerConnection:
             case ViewerOrder():
                 self._guard.check_operator(message.token)
                 _logger.info("a page orders: %s", message.order)
-                reason = await asyncio.to_thread(self._data.give_order, message.order)
-                if reason:
-                    raise ClientError("unavailable", reason)
-                await self._send({"type": "ordered", "order": message.order})
+                accepted, result = await asyncio.to_thread(self._data.give_order, message.order)
+                if not accepted:
+                    raise ClientError("unavailable", result)
+                await self._send({"type": "ordered", "order": message.order, "result": result})
             case ViewerCamera(on=on):
                 if self._camera is not None:
                     self._camera.cancel()

@@ -1,4 +1,4 @@
-"""Recording of metrics rows with the writers and the progress line.
+"""Recording of metrics rows with the writers and the progress line, and of the events.
 
 The recorder has its own thread, so a slow disk or a slow start of a writer does not delay training.
 """
@@ -25,13 +25,22 @@ OpenWriter = Callable[[], MetricsWriter]  # opens the files; raises OSError
 class Recorder:
     """Recorder of metrics rows, in order, from construction to `close`."""
 
-    def __init__(self, open_writers: Sequence[OpenWriter], progress: Progress) -> None:
+    def __init__(
+        self,
+        open_writers: Sequence[OpenWriter],
+        progress: Progress,
+        write_events: Callable[[], None] = lambda: None,
+    ) -> None:
         """Construct the recorder and start its thread.
 
         Args:
           open_writers: called at the first row, and again after a writer failed.
           progress: shows each row.
+          write_events: called after each row; it raises no OSError.
         """
+        self.busy_since: float | None = None  # since when a row is being written, if one is; on the monotonic clock
+        self._dropped = 0  # rows, since the last that was queued
+        self._write_events = write_events
         self._open_writers, self._progress = open_writers, progress
         self._writers: list[MetricsWriter] = []
         self._failed_at: float | None = None
@@ -41,21 +50,34 @@ class Recorder:
 
     def record(self, row: dict[str, float], details: Details) -> None:
         """Queue a row. Does not block; drops the row if the queue is full."""
-        with contextlib.suppress(queue.Full):
+        try:
             self._rows.put_nowait((row, details))
+        except queue.Full:
+            self._dropped += 1
+            return
+        if self._dropped:
+            _logger.warning("%d rows of metrics are missing: the disk was slow", self._dropped)
+            self._dropped = 0
 
     def close(self) -> None:
-        """Write the queued rows, and close the writers."""
-        with contextlib.suppress(queue.Full):  # a writer hangs: its rows are lost, but the run must end
+        """Write the queued rows, and close the writers. If a writer hangs, its rows are lost, but the run must end."""
+        began = time.monotonic()
+        with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_SECONDS)
-        self._thread.join(timeout=_CLOSE_SECONDS)
+        self._thread.join(timeout=max(began + _CLOSE_SECONDS - time.monotonic(), 0.0))
+        if self._thread.is_alive():
+            lost = self._rows.qsize() + self._dropped
+            _logger.warning("metrics not written: the last %d rows are lost: the disk is slow", lost)
         self._progress.end()
 
     def _work(self) -> None:
         while (taken := self._rows.get()) is not None:
             self._progress.show(taken[0])
+            self.busy_since = time.monotonic()
             if self._failed_at is None or time.monotonic() >= self._failed_at + _RETRY_SECONDS:
                 self._write(*taken)
+            self._write_events()
+            self.busy_since = None
         self._close_writers()
 
     def _write(self, row: dict[str, float], details: Details) -> None:

@@ -10,7 +10,7 @@ from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
-from daedalus.learner.run.event_file import RESUMED, EventFile
+from daedalus.learner.run.event_file import RESUMED
 from daedalus.learner.run.run_directory import EVALUATION, METRICS, SUMMARY, read_json, write_json
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.run.settings import SettingsError
@@ -27,28 +27,24 @@ _logger = logging.getLogger(__name__)
 class RunRecords:
     """Writer of the records of one run during training, from construction to `close`."""
 
-    def __init__(
-        self, state: RunState, reporter: RunReporter, history: MetricsHistory, events: EventLog, recorder: Recorder
-    ) -> None:
+    def __init__(self, state: RunState, reporter: RunReporter, history: MetricsHistory, recorder: Recorder) -> None:
         """Construct the writer.
 
         Args:
           state: names the directory.
           reporter: source of the rows and of the summary.
           history: receives each row, for operators who watch the run.
-          events: source of the events.
           recorder: writes the rows; it is closed with the records.
         """
         self._directory, self._reporter = state.directory, reporter
-        self._history, self._events, self._recorder = history, events, recorder
-        self._event_file = EventFile(state.directory)
+        self._history, self._recorder = history, recorder
+        state.health.recording_since = lambda: recorder.busy_since
 
     def record(self, learner: "Learner", now: float, *, last: bool = False) -> None:
-        """Record a row of metrics and the new events, and log a hint if one is due. `last` marks the row of a stop."""
+        """Record a row of metrics, and log a hint if one is due. `last` marks the row of a stop."""
         row = self._reporter.row(learner, now, last=last)
         self._history.add(row)
         self._recorder.record(row, self._reporter.details(learner, now, last=last))
-        self._event_file.add(self._events.take_new())
         if not last and (hint := self._reporter.hint()):
             _logger.warning("%s", hint)
 

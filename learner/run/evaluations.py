@@ -3,6 +3,7 @@
 The checkpoint of a policy is kept while an evaluator plays the policy. The best checkpoints are kept permanently.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,24 @@ from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER
 _MAX_IN_PROGRESS = 16
 
 
+@dataclass(frozen=True, slots=True)
+class Evaluated:
+    """Result of an evaluation that was accepted."""
+
+    directory: Path  # of the checkpoint
+    policy_version: int
+    mean: float
+    text: str  # a log message
+
+    def keep(self) -> str:
+        """Keep the checkpoint if it is among the best, and return the log message with what came of that."""
+        try:
+            best = keep_if_best(self.directory, self.mean, self.policy_version)
+        except OSError as error:
+            return f"{self.text}, the best so far, but its checkpoint was not kept: {error.strerror or error}"
+        return self.text + (", the best so far" if best else "")
+
+
 @dataclass(slots=True)
 class Evaluations:
     """Evaluations of one run during one learner epoch."""
@@ -27,6 +46,7 @@ class Evaluations:
     counters: RunCounters
     # By evaluator: checkpoint directory, policy version, env_steps.
     in_progress: dict[str, tuple[Path, int, int]] = field(default_factory=dict)
+    heard: float = -math.inf  # when an evaluator last asked or reported, on the monotonic clock
     newest: dict[str, float] = field(default_factory=dict)  # columns of learner/reporting/metrics.py, until taken
 
     @property
@@ -50,23 +70,19 @@ class Evaluations:
             del self.in_progress[keys.first_of_largest_owner(self.in_progress)]
         self.in_progress[evaluator] = directory, policy_version, env_steps
 
-    def report(self, report: EvaluationReport) -> tuple[Acknowledgement, str]:
-        """Record the result of an evaluation. Return the answer to the evaluator and a log message.
-
-        The log message is empty if the report is not accepted.
-        """
+    def report(self, report: EvaluationReport) -> tuple[Acknowledgement, Evaluated | None]:
+        """Record an evaluation. Return the answer to the evaluator, and the result if the report is accepted."""
         if report.learner_epoch != self.learner_epoch:
-            return Acknowledgement(verdict="fenced", reason="the report is for another learner epoch"), ""
+            return Acknowledgement(verdict="fenced", reason="the report is for another learner epoch"), None
         directory, version, env_steps = self.in_progress.get(report.evaluator, (None, -1, 0))
         if directory is None or version != report.policy_version:
             reason = f"evaluator {report.evaluator!r} has no evaluation of policy version {report.policy_version}"
-            return Acknowledgement(verdict="rejected", reason=reason), ""
+            return Acknowledgement(verdict="rejected", reason=reason), None
         if not (np.abs(report.returns) <= LARGEST_EPISODE_NUMBER).all():
-            return Acknowledgement(
-                verdict="rejected", reason="returns has a value that is not finite, or too large"
-            ), ""
+            reason = "returns has a value that is not finite, or too large"
+            return Acknowledgement(verdict="rejected", reason=reason), None
         if (report.lengths < 1).any():
-            return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), ""
+            return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), None
         del self.in_progress[report.evaluator]
         mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
         self.counters.evaluated(mean)
@@ -78,11 +94,7 @@ class Evaluations:
         }
         result = f"{short_number(mean)} +- {short_number(std)} over {len(report.returns)} episodes"
         text = f"evaluation at {env_steps:,} env_steps: {result}"
-        try:
-            text += ", the best so far" if keep_if_best(directory, mean, version) else ""
-        except OSError as error:
-            text += f", the best so far, but its checkpoint was not kept: {error.strerror or error}"
-        return Acknowledgement(verdict="accepted"), text
+        return Acknowledgement(verdict="accepted"), Evaluated(directory, version, mean, text)
 
     def take_newest(self) -> dict[str, float]:
         """Return the newest evaluation as metrics; empty without an evaluation since the last call."""

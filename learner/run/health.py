@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 _STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
 _FAR_SECONDS = 60.0  # so long after a rollout far outside what others send, its sender is a problem
+SLOW_DISK_SECONDS = 10.0  # in which a disk has written a checkpoint, or a row of metrics
 _NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
 
 
@@ -15,12 +16,16 @@ class Health:
     started: float
     updated: float  # time of the last update, or the start
     actor_seen: float  # last time with a live actor, or the start
+    directory: str = ""  # of the run, as the problems name it
     saved: float | None = None  # time of the last checkpoint
+    saving_since: float | None = None  # since when a checkpoint is being written, if one is
     save_fault: str = ""  # error of the last checkpoint, if it failed
     left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
     # By actor whose rollouts were left out because their numbers are far outside: which numbers, and the last time.
     far_outside: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     gradient_fault: bool = False  # whether the last update was skipped
+    # Since when metrics and events are being written, or None if they are not.
+    recording_since: Callable[[], float | None] = lambda: None
     # Days until the certificate of this process expires, or None without one.
     certificate_days_left: Callable[[], float | None] = lambda: None
 
@@ -54,4 +59,8 @@ class Health:
             found.append("updates are skipped: the gradient is not finite")
         if self.save_fault:
             found.append(f"checkpoints cannot be saved: {self.save_fault}")
+        for what, since in (("the checkpoint has", self.saving_since), ("metrics have", self.recording_since())):
+            if since is not None and now - since > SLOW_DISK_SECONDS:
+                waited = f"{what} been writing for {now - since:.0f} s"
+                found.append(f"{waited}: the disk of {self.directory} is slow; training continues")
         return tuple(found)

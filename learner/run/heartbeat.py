@@ -6,6 +6,7 @@ processes of a machine share until it restarts, and which nobody sets.
 
 import contextlib
 import os
+import threading
 import time
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from daedalus.policy.saving.regular_files import open_own, read_regular
 
 HEARTBEAT = "heartbeat"
 _BEAT_SECONDS = 1.0
+_END_SECONDS = 1.0  # for the last beat to be written
 _MAX_SILENCE_SECONDS = 120.0  # longer than one update or one checkpoint takes
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
@@ -22,10 +24,23 @@ class Heartbeat:
 
     def __init__(self, directory: Path) -> None:
         self._path = directory / HEARTBEAT
-        self._due = 0.0
+        self._due = self._newest = 0.0
+        self._thread: threading.Thread | None = None
+        self._beaten, self._ended = threading.Event(), False
+
+    def start(self) -> None:
+        """Write the beats on a thread of its own from now on, so that a slow disk does not delay the caller."""
+        self._thread = threading.Thread(target=self._work, name="heartbeat", daemon=True)
+        self._thread.start()
 
     def clear(self) -> None:
         """Remove the file, at the start and at the end of the process: without a file, nothing is wrong."""
+        if self._thread is not None:
+            self._ended = True
+            self._beaten.set()
+            self._thread.join(_END_SECONDS)
+            if self._thread.is_alive():  # the disk does not answer
+                return
         with contextlib.suppress(OSError):
             self._path.unlink()
 
@@ -35,6 +50,18 @@ class Heartbeat:
         if now < self._due:
             return
         self._due = now + _BEAT_SECONDS
+        if self._thread is None:
+            self._write(now)
+        else:
+            self._newest = now
+            self._beaten.set()
+
+    def _work(self) -> None:
+        while self._beaten.wait() and not self._ended:
+            self._beaten.clear()
+            self._write(self._newest)
+
+    def _write(self, now: float) -> None:
         with contextlib.suppress(OSError):
             file = open_own(self._path, os.O_WRONLY | os.O_CREAT, 0o644)  # not cut: a full disk has no room for more
             try:

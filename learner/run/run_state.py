@@ -50,7 +50,11 @@ class RunState:
         self.annealing = Annealing(budget=spec.training.env_steps)
         self.evaluations = Evaluations(self.learner_epoch, self.counters)
         self.health = Health(
-            started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
+            started=started,
+            updated=started,
+            actor_seen=started,
+            directory=str(directory),
+            certificate_days_left=certificate_days_left,
         )
 
     @property

@@ -264,8 +264,7 @@ class ActorServer:
             request.reply(encode(message))
             return
         _logger.info("an operator orders: %s", message.order)
-        self._orders.give(message.order)
-        request.reply(encode(Acknowledgement(verdict="accepted")))
+        self._orders.give(message.order, request)
 
     def _on_status(self, request: Request) -> None:
         if request.payload != LOOK:

@@ -19,6 +19,7 @@ import safetensors.torch
 from torch import Tensor
 
 from daedalus.learner.run.counters import check_counters
+from daedalus.policy.saving.best_checkpoints import TrainingScore, keep_if_best, training_score
 from daedalus.policy.saving.saved_policy import (
     FORMAT,
     PARAMETERS_FILE,
@@ -55,8 +56,16 @@ class Checkpoint:
     counters: dict[str, Any]  # from RunCounters.state
 
 
-def save_checkpoint(
-    run_directory: Path,
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EncodedCheckpoint:
+    """Content of a checkpoint in memory of its own, which no update changes: another thread may write it."""
+
+    policy_version: int
+    files: dict[str, bytes]
+    content: dict[str, Any]
+
+
+def encode_checkpoint(
     *,
     spec: RunSpec,
     spaces: Spaces,
@@ -65,14 +74,9 @@ def save_checkpoint(
     parameters: dict[str, np.ndarray],
     state: dict[str, Tensor],
     counters: dict[str, Any],
-    keep: int,
-    also_keep: Set[Path] = frozenset(),
-) -> Path:
-    """Write a checkpoint, remove all others but the newest `keep` and `also_keep`, and return its directory.
-
-    Raises OSError on a disk error; the existing checkpoints then stay.
-    """
-    directory = checkpoint_path(run_directory, policy_version)
+    score: TrainingScore | None = None,
+) -> EncodedCheckpoint:
+    """Copy the state of a learner, between two updates; `score` is of the training episodes, if there is one."""
     files = {
         PROGRAM_FILE: program,
         PARAMETERS_FILE: safetensors.numpy.save(parameters),
@@ -84,12 +88,32 @@ def save_checkpoint(
         "spec": spec.model_dump(mode="json"),
         "spaces": spaces.model_dump(mode="json"),
         "counters": counters,
+        **({} if score is None else {"score": score.described()}),
     }
-    write_sealed(directory, files, content)
+    return EncodedCheckpoint(policy_version=policy_version, files=files, content=content)
+
+
+def save_checkpoint(
+    run_directory: Path, encoded: EncodedCheckpoint, *, keep: int, also_keep: Set[Path] = frozenset()
+) -> Path:
+    """Write a checkpoint, remove all others but the newest `keep` and `also_keep`, and return its directory.
+
+    Those that are among the best by their training episodes are kept under their score.
+
+    Raises OSError on a disk error; the existing checkpoints then stay.
+    """
+    directory = checkpoint_path(run_directory, encoded.policy_version)
+    write_sealed(directory, encoded.files, encoded.content)
     # A damaged checkpoint of a higher version may exist, if it could not be set aside.
     others = [other for other in checkpoints(run_directory) if other != directory]
     for old in others[keep - 1 :]:
         if old not in also_keep:
+            try:
+                if (score := training_score(old)) is not None:
+                    keep_if_best(old, score, int(old.name), training=True)
+            except OSError as error:  # it is not removed: it may be the best
+                _logger.warning("%s cannot be kept under its score: %s", old, error.strerror or error)
+                continue
             remove_sealed(old)
     for unfinished in directory.parent.glob(".*"):  # left by a crash, or set aside
         if is_unfinished(unfinished):

@@ -18,7 +18,7 @@ import safetensors.numpy
 from pydantic import Field, TypeAdapter
 
 from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
-from daedalus.policy.saving.best_checkpoints import best_checkpoints
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.spaces import Spaces
@@ -70,13 +70,17 @@ def checkpoints(run_directory: Path) -> list[Path]:
 def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     """Return the policy of a checkpoint, or the best policy of a run directory.
 
-    The newest policy of the run is returned if no checkpoint has a score or `newest` is true. Damaged checkpoints are
-    logged and skipped. Raises NoPolicyError if there is no checkpoint, DamagedError if none is readable,
-    OtherFormatError for a run of another release.
+    The best is that with the highest score of an evaluation; if no checkpoint has one, that with the highest score of
+    training episodes. The newest policy of the run is returned if no checkpoint has a score or `newest` is true.
+    Damaged checkpoints are logged and skipped.
+
+    Raises NoPolicyError if there is no checkpoint, DamagedError if none is readable, OtherFormatError for a run of
+    another release.
     """
     if (directory / "manifest.json").exists():
         return read_policy(directory)
-    candidates = [*([] if newest else best_checkpoints(directory)), *checkpoints(directory)]
+    best = [] if newest else [*best_checkpoints(directory), *best_in_training(directory)]
+    candidates = [*best, *checkpoints(directory)]
     if not candidates:
         raise NoPolicyError(_no_checkpoints(directory))
     for candidate in candidates:

@@ -9,7 +9,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 import pytest
-from processes import LIMIT
+from processes import LIMIT, until
 
 from daedalus.cli import child_output
 from daedalus.cli.child_output import STREAMS, ChildOutput, OutputLog, RateLimit
@@ -138,6 +138,36 @@ def test_a_closed_terminal_or_a_full_disk_stops_nothing(tmp_path: Path) -> None:
         words = [sys.executable, "-S", "-c", "print('x\\n' * 100_000)"]
         assert subprocess.run(words, stdout=streams.stdout, stderr=streams.stderr).returncode == 0
     output.close()
+
+
+def test_a_disk_that_does_not_answer_does_not_stop_the_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = threading.Event()
+    append = OutputLog._append
+
+    def hang(log: OutputLog, data: bytes) -> None:
+        assert answers.wait(LIMIT)
+        append(log, data)
+
+    monkeypatch.setattr(OutputLog, "_append", hang)
+    monkeypatch.setattr(child_output, "_WAITING_WRITES", 2)
+    monkeypatch.setattr(child_output, "_SLOW_SECONDS", 0.05)
+    monkeypatch.setattr(child_output, "_CLOSE_SECONDS", 0.05)
+    log = OutputLog(tmp_path / "output.log")
+    for number in range(10):
+        log.write([f"line {number}\n".encode()])
+    log.close()  # does not wait for ever
+    answers.set()
+
+    def note_is_written() -> bool:
+        log.write([b"last\n"])
+        return " lines are left out: the disk was slow\nlast\n" in (tmp_path / "output.log").read_text()
+
+    until((tmp_path / "output.log").exists)
+    until(note_is_written)
+    monkeypatch.setattr(child_output, "_CLOSE_SECONDS", LIMIT)
+    log.close()
 
 
 def test_the_log_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

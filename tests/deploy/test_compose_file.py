@@ -20,8 +20,10 @@ def test_the_build_context_holds_every_package() -> None:
     assert packages | files == kept
 
 
-def test_the_default_services_are_router_learner_and_actor() -> None:
-    assert {name for name, service in SERVICES.items() if "profiles" not in service} == {"router", "learner", "actor"}
+def test_the_default_services_are_router_learner_actor_and_evaluator() -> None:
+    default = {name for name, service in SERVICES.items() if "profiles" not in service}
+    assert default == {"router", "learner", "actor", "evaluator"}
+    assert "--evaluator" in SERVICES["evaluator"]["command"]
     monitoring = {name for name, service in SERVICES.items() if service.get("profiles") == ["monitoring"]}
     assert monitoring == {"exporter", "tensorboard", "prometheus", "grafana"}
 

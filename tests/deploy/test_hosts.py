@@ -34,7 +34,7 @@ def unit(path: Path) -> configparser.ConfigParser:
     return parsed
 
 
-@pytest.mark.parametrize(("path", "roles"), [(UNIT, ["learner", "exporter"]), (ACTOR_UNIT, ["actor"])])
+@pytest.mark.parametrize(("path", "roles"), [(UNIT, ["learner", "exporter"]), (ACTOR_UNIT, ["actor", "actor"])])
 def test_the_example_arguments_of_the_systemd_units_are_valid(path: Path, roles: list[str]) -> None:
     arguments = re.findall(r"^# +/etc/daedalus/\S+: +ARGUMENTS=(.*)$", path.read_text(), re.MULTILINE)
     assert [check(line.split()) for line in arguments] == roles

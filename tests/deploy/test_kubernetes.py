@@ -76,6 +76,7 @@ def test_the_kustomizations_name_every_manifest() -> None:
         "Job/learner",
         "PodDisruptionBudget/actor",
         "Deployment/actor",
+        "Deployment/evaluator",
         "NetworkPolicy/router",
         "NetworkPolicy/clients",
         "HorizontalPodAutoscaler/actor",
@@ -159,7 +160,7 @@ def words_of(container: Manifest) -> list[str]:
 
 def test_the_command_of_each_container_is_valid() -> None:
     commands = [check(words_of(container)) for _, container in containers()]
-    assert commands == ["router", "learner", "actor", "exporter"]
+    assert commands == ["router", "learner", "actor", "actor", "exporter"]
 
 
 def test_the_probes_check_the_run_of_the_learner() -> None:
@@ -263,7 +264,13 @@ def test_the_components_render_to_valid_manifests_with_tls_everywhere(tmp_path: 
     assert found.keys() == ALL.keys() | secrets
     for name, each in of_kubernetes(found).items():
         kubernetes_validate.validate(each, VERSIONS[-1], strict=True)
-        if name in ("Deployment/router", "Job/learner", "Deployment/actor", "Deployment/exporter"):
+        if name in (
+            "Deployment/router",
+            "Job/learner",
+            "Deployment/actor",
+            "Deployment/evaluator",
+            "Deployment/exporter",
+        ):
             words = words_of(each["spec"]["template"]["spec"]["containers"][0])
             check(words)
             assert words[words.index("--tls") + 1] == "/tls"
@@ -273,5 +280,7 @@ def test_the_components_render_to_valid_manifests_with_tls_everywhere(tmp_path: 
 
 
 def test_the_names_of_actors_fit_their_certificate() -> None:
-    words = words_of(read("tls/actor.yaml")["spec"]["template"]["spec"]["containers"][0])
-    assert owner(words[words.index("--name") + 1]) == "actor"  # docs/deploy.md issues a certificate of this name
+    for path in ("tls/actor.yaml", "tls/evaluator.yaml"):
+        words = words_of(read(path)["spec"]["template"]["spec"]["containers"][0])
+        assert owner(words[words.index("--name") + 1]) == "actor"  # docs/deploy.md issues a certificate of this name
+        assert ("--evaluator" in words) == ("evaluator" in path)

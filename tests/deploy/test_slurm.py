@@ -64,7 +64,7 @@ def test_the_commands_of_the_slurm_script_are_valid() -> None:
     commands = [shlex.split(re.sub(r"\s*&$", "", line.replace("$host", "node"))) for line in lines]
     for words in commands[:2]:
         assert certs_parser().parse_args(words[1:])
-    assert [check(words) for words in commands[2:]] == ["router", "actor", "learner"]
+    assert [check(words) for words in commands[2:]] == ["router", "actor", "actor", "learner"]
 
 
 def test_certificates_are_in_a_private_folder_that_is_removed(job: subprocess.Popen[bytes], tmp_path: Path) -> None:
@@ -74,8 +74,14 @@ def test_certificates_are_in_a_private_folder_that_is_removed(job: subprocess.Po
     def used() -> list[str]:
         return [line for line in (tmp_path / "calls").read_text().splitlines() if not line.startswith("certs")]
 
-    until(lambda: len(used()) == 3)  # the learner may be the first of them to run
-    assert sorted(line.rpartition(str(folder))[2] for line in used()) == ["/actor-node", "/learner", "/router"]
+    until(lambda: len(used()) == 4)  # the learner may be the first of them to run
+    evaluator = "/actor-node --name node.evaluator --evaluator"
+    assert sorted(line.rpartition(str(folder))[2] for line in used()) == [
+        "/actor-node",
+        evaluator,
+        "/learner",
+        "/router",
+    ]
     (tmp_path / "end-learner").touch()
     job.wait(LIMIT)
     assert not folder.exists()

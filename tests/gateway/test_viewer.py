@@ -164,7 +164,11 @@ def test_orders_need_the_operators_token(gateway: RunningGateway, watch: Watch) 
     assert "not the operator's token" in viewer.receive("refused")["reason"]
     assert source.orders == []
     viewer.send(type="order", order="checkpoint", token=TOKEN)
-    assert viewer.receive("ordered") == {"type": "ordered", "order": "checkpoint"}
+    assert viewer.receive("ordered") == {
+        "type": "ordered",
+        "order": "checkpoint",
+        "result": "checkpoint saved at 7 env_steps",
+    }
     assert source.orders == ["checkpoint"]
 
 
@@ -311,7 +315,7 @@ def test_beyond_loopback_a_page_needs_a_token_and_orders_that_of_an_operator(
     running = RunningGateway(network, made / "gateway", follows=False)
     context = ssl.create_default_context(cafile=made / "gateway" / "ca.pem")
     orders: list[str] = []
-    running.call(lambda: setattr(running.data, "give_order", lambda order: orders.append(order) or ""))
+    running.call(lambda: setattr(running.data, "give_order", lambda order: (orders.append(order) is None, "")))
     try:
         for token, admitted in (("", False), ("wrong", False), (phone, True), (operator, True)):
             with connect(f"wss://127.0.0.1:{running.port}/watch", ssl=context, open_timeout=LIMIT) as socket:

@@ -87,9 +87,9 @@ class FakeSource:
             values=np.array(values, np.float64).reshape(len(numbers), len(columns)),
         )
 
-    def order(self, status: RunStatus, order: Order) -> str:
+    def order(self, status: RunStatus, order: Order) -> tuple[bool, str]:
         self.orders.append(order)
-        return ""
+        return True, "checkpoint saved at 7 env_steps" if order == "checkpoint" else ""
 
 
 def observed(status: RunStatus, rows: list[dict[str, float]] | None = None, **fields: object) -> Observation:

@@ -12,7 +12,7 @@ import torch
 from building import SPACES, run_spec
 from log_lines import LINES
 
-from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
+from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, load_newest, save_checkpoint
 from daedalus.policy.saving import sealed
 from daedalus.policy.saving.regular_files import read_regular
 from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkpoints, find_policy, read_policy
@@ -45,7 +45,7 @@ def save(run: Path, version: int, keep: int = 9, **replaced: Any) -> Path:
         "state": state(version),
         "counters": COUNTERS,
     }
-    return save_checkpoint(run, policy_version=version, keep=keep, **{**content, **replaced})
+    return save_checkpoint(run, encode_checkpoint(policy_version=version, **{**content, **replaced}), keep=keep)
 
 
 def names(run: Path) -> list[str]:

@@ -11,7 +11,7 @@ from building import ENVIRONMENTS, ROWS, SPACES, make_rollout, run_spec
 from plain import NAME, act, array_space
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
+from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.spaces import ArraySpace, Spaces
@@ -78,8 +78,7 @@ def test_program_and_checkpoints_from_cuda_work_on_cpu(tmp_path: Path) -> None:
     observations = np.random.default_rng(1).integers(0, 256, (5, *array_space(spaces).stacked_shape), np.uint8)
     actions, _, _ = act(runtime, observations, np.zeros((5, 0), np.float32))
     assert actions.shape == (5,)
-    directory = save_checkpoint(
-        tmp_path,
+    encoded = encode_checkpoint(
         spec=run_spec(),
         spaces=spaces,
         policy_version=there.policy_version,
@@ -87,8 +86,8 @@ def test_program_and_checkpoints_from_cuda_work_on_cpu(tmp_path: Path) -> None:
         parameters=there.weights(),
         state=there.state(),
         counters=RunCounters(1).state(0.0),
-        keep=1,
     )
+    directory = save_checkpoint(tmp_path, encoded, keep=1)
     checkpoint = load_checkpoint(directory)
     here = learner("cpu", policy, spaces)
     here.restore(checkpoint.policy.policy_version, checkpoint.policy.weights, checkpoint.state)

@@ -8,9 +8,10 @@ import pytest
 from building import EPOCH, SPACES, run_spec
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.evaluations import Evaluations
+from daedalus.learner.run.evaluations import Evaluated, Evaluations
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
+from daedalus.learner.training.checkpointer import Saving
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -18,7 +19,6 @@ from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
     EvaluationRequest,
-    Refusal,
     Snapshot,
 )
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -34,17 +34,24 @@ class FakeLearner:
 
 
 class FakeCheckpointer:
-    """Checkpointer that moves the clock instead of writing."""
+    """Checkpointer that moves the clock instead of copying, and that writes as long as the test says."""
 
     def __init__(self, scene: "Scene") -> None:
         self._scene = scene
         self.saved_at: list[float] = []
-        self.disk_is_full = False
+        self.kept: list[Evaluated] = []
+        self.idle, self.seconds = True, 0.0
 
-    def ensure_saved(self) -> Path | None:
+    def begin(self, *, again: bool) -> Saving:
+        assert self.idle
+        assert not again
         self.saved_at.append(self._scene.now)
         self._scene.now += self._scene.save_seconds
-        return None if self.disk_is_full else Path(f"checkpoint-{self._scene.learner.policy_version}")
+        version = self._scene.learner.policy_version
+        return Saving(version, 1000, Path(f"checkpoint-{version}"))
+
+    def keep(self, evaluated: Evaluated) -> None:
+        self.kept.append(evaluated)
 
 
 class Scene:
@@ -166,12 +173,10 @@ def test_evaluator_that_asks_rarely_never_waits(scene: Scene) -> None:
         scene.now += 0.6
 
 
-def test_reports_are_answered_while_requests_wait(scene: Scene, tmp_path: Path) -> None:
+def test_reports_are_answered_while_requests_wait(scene: Scene) -> None:
     scene.request()
     scene.serve()
     waiting = scene.request("f")
-    scene.evaluations.in_progress["e"] = tmp_path / "checkpoints" / "0", 1, 1000
-    (tmp_path / "checkpoints" / "0").mkdir(parents=True)
     answers = scene.report(1)
     scene.serve()
     assert isinstance(answers[0], Acknowledgement)
@@ -179,13 +184,25 @@ def test_reports_are_answered_while_requests_wait(scene: Scene, tmp_path: Path) 
     assert waiting == []
 
 
-def test_evaluators_are_refused_when_the_disk_is_full(scene: Scene) -> None:
-    scene.checkpointer.disk_is_full = True
+def test_evaluator_waits_only_while_an_earlier_checkpoint_is_written(scene: Scene) -> None:
+    """Where each checkpoint takes minutes, evaluations go on: the policy is handed out before it is written."""
+    scene.checkpointer.idle = False
     answers = scene.request()
     scene.serve()
-    assert isinstance(answers[0], Refusal)
-    assert (answers[0].code, answers[0].reason) == ("not_ready", "the checkpoint of the policy could not be saved")
-    assert scene.evaluations.in_progress == {}
+    assert answers == []
+    scene.checkpointer.idle, scene.checkpointer.seconds = True, 105.0
+    scene.serve()
+    assert isinstance(answers[0], Snapshot)
+    assert scene.evaluations.heard == scene.now
+    scene.now += 29.0
     again = scene.request()
     scene.serve()
-    assert again == []  # a failed save takes time too
+    assert again == []  # writing takes time too, of other threads
+    scene.now += 2.0
+    scene.serve()
+    assert isinstance(again[0], Snapshot)
+    answers = scene.report(1)
+    scene.checkpointer.idle = False
+    scene.serve()
+    assert answers[0].verdict == "accepted"  # at once; the checkpoint is kept later
+    assert [each.policy_version for each in scene.checkpointer.kept] == [1]

@@ -12,7 +12,7 @@ from building import EPOCH, SPACES, run_spec
 from daedalus.learner.reporting.metrics import COLUMNS
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.evaluations import Evaluations
-from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
+from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, load_newest, save_checkpoint
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
@@ -26,8 +26,7 @@ class Run:
         self.evaluations = Evaluations(epoch, RunCounters(10))
 
     def save(self, version: int, keep: int = 2) -> Path:
-        return save_checkpoint(
-            self.directory,
+        encoded = encode_checkpoint(
             spec=run_spec(),
             spaces=SPACES,
             policy_version=version,
@@ -35,9 +34,8 @@ class Run:
             parameters={"w": np.full(3, version, np.float32)},
             state={},
             counters=RunCounters(1).state(0.0),
-            keep=keep,
-            also_keep=self.evaluations.checkpoints_in_use,
         )
+        return save_checkpoint(self.directory, encoded, keep=keep, also_keep=self.evaluations.checkpoints_in_use)
 
     def begin(self, version: int, evaluator: str = "e") -> Path:
         directory = self.save(version)
@@ -47,7 +45,7 @@ class Run:
     def report(
         self, version: int, *returns: float, evaluator: str = "e", epoch: int = EPOCH
     ) -> tuple[Acknowledgement, str]:
-        return self.evaluations.report(
+        return self.send(
             EvaluationReport(
                 evaluator=evaluator,
                 learner_epoch=epoch,
@@ -56,6 +54,11 @@ class Run:
                 lengths=np.arange(1, len(returns) + 1, dtype=np.int32),
             )
         )
+
+    def send(self, report: EvaluationReport) -> tuple[Acknowledgement, str]:
+        """Return the answer and the log message, after the checkpoint was kept if it is to be."""
+        answer, evaluated = self.evaluations.report(report)
+        return answer, evaluated.keep() if evaluated is not None else ""
 
     def play(self, version: int, *returns: float) -> str:
         """Run one evaluation from request to report, and return its log message."""
@@ -243,7 +246,7 @@ def test_report_with_a_length_below_1_is_rejected(run: Run) -> None:
     report = EvaluationReport(
         evaluator="e", learner_epoch=EPOCH, policy_version=1, returns=np.ones(2, np.float32), lengths=lengths
     )
-    assert_not_accepted(run, *run.evaluations.report(report), "rejected", "lengths has a value below 1")
+    assert_not_accepted(run, *run.send(report), "rejected", "lengths has a value below 1")
 
 
 # -------------------------------------------------------------------------------------------------- metrics

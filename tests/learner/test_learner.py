@@ -15,7 +15,7 @@ from torch.testing import assert_close
 
 from daedalus.algorithms.gradients import Terms
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
+from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, save_checkpoint
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS, UpdateMetrics
@@ -354,8 +354,7 @@ def test_observation_image_shows_the_stacked_frames_side_by_side(
 
 
 def saved(learner: Learner, directory: Path) -> Path:
-    return save_checkpoint(
-        directory,
+    encoded = encode_checkpoint(
         spec=run_spec(),
         spaces=SPACES,
         policy_version=learner.policy_version,
@@ -363,8 +362,8 @@ def saved(learner: Learner, directory: Path) -> Path:
         parameters=learner.weights(),
         state=learner.state(),
         counters=RunCounters(1).state(0.0),
-        keep=1,
     )
+    return save_checkpoint(directory, encoded, keep=1)
 
 
 def restored(learner: Learner, directory: Path) -> Learner:

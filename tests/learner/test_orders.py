@@ -1,5 +1,6 @@
 """Orders of an operator, and the metrics that an operator reads, over the memory transport."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -52,8 +53,10 @@ def test_operator_orders_a_checkpoint_then_the_end(network: MemoryNetwork, tmp_p
     actor.open_gate()
     until(lambda: steps(operator.metrics()))
     assert checkpoints(tmp_path / "run") == []
-    assert operator.order(OrderRequest(order="checkpoint")) == Acknowledgement(verdict="accepted")
-    until(lambda: checkpoints(tmp_path / "run"))
+    answer = operator.order(OrderRequest(order="checkpoint"))
+    assert isinstance(answer, Acknowledgement)
+    assert re.fullmatch(r"checkpoint saved at \d+ env_steps", answer.reason)
+    assert checkpoints(tmp_path / "run")  # it is there when the answer says so
     assert not learner.ended
     assert operator.order(OrderRequest(order="stop")) == Acknowledgement(verdict="accepted")
     outcome = learner.join()

@@ -5,6 +5,7 @@ import os
 import re
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from log_lines import LINES
@@ -13,14 +14,19 @@ from session_fleet import GatedActor, LearnerProcess
 
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.config import ActorConfig
+from daedalus.learner.reporting import recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
-from daedalus.learner.serving import actor_server
+from daedalus.learner.run import health, heartbeat
+from daedalus.learner.serving import actor_server, orders
 from daedalus.learner.training import checkpointer
 from daedalus.learner.training.checkpoint import load_newest
+from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.protocol import keys
-from daedalus.protocol.codec import decode
+from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Message, Refusal
+from daedalus.protocol.messages import Acknowledgement, Message, Refusal, StatusReport
+from daedalus.protocol.orders import OrderRequest
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 ACTORS = 15
@@ -155,6 +161,69 @@ def test_error_of_the_last_checkpoint_is_logged_and_promises_no_other_attempt(
         error,
     )
     assert actor.join()
+
+
+def test_training_goes_on_and_a_learner_ends_while_its_disk_does_not_answer(
+    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every call that waits for the disk hangs from some moment on, as on a network's file system that is gone."""
+    gone, back = threading.Event(), threading.Event()
+
+    def hanging(name: str) -> None:
+        function = getattr(os, name)
+
+        def hang(*arguments: Any, **options: Any) -> Any:
+            if gone.is_set() and threading.current_thread().name in learners_threads:
+                assert back.wait(LIMIT)
+            return function(*arguments, **options)
+
+        monkeypatch.setattr(os, name, hang)
+
+    learner = LearnerProcess(network, tmp_path / "run")
+    learners_threads = {learner.name, "checkpoints", "recorder", "heartbeat"}
+    for name in ("fsync", "pwrite", "open", "replace"):
+        hanging(name)
+    monkeypatch.setattr(checkpointer, "STOP_SECONDS", 0.1)
+    monkeypatch.setattr(recorder, "_CLOSE_SECONDS", 0.1)
+    monkeypatch.setattr(heartbeat, "_END_SECONDS", 0.1)
+    monkeypatch.setattr(health, "SLOW_DISK_SECONDS", 0.0)
+    monkeypatch.setattr(orders, "_ANSWER_SECONDS", 0.05)
+    operator = MemoryTransport(network)
+
+    def order() -> Acknowledgement:
+        answer = decode(
+            operator.query(keys.orders("run"), encode(OrderRequest(order="checkpoint")), timeout=LIMIT)[0], Limits()
+        )
+        assert isinstance(answer, Acknowledgement)
+        return answer
+
+    def status() -> RunStatus:
+        report = decode(operator.query(keys.status("run"), timeout=LIMIT)[0], Limits())
+        assert isinstance(report, StatusReport)
+        return report.status
+
+    try:
+        actor = GatedActor(network, "actor")
+        actor.open_gate()
+        until(lambda: count("joined run") == 1)
+        order()
+        until(lambda: checkpoints(tmp_path / "run"))
+        saved = checkpoints(tmp_path / "run")
+        gone.set()
+        assert order().reason.startswith("not saved yet: the events")
+        before = status()
+        until(lambda: status().updates > before.updates + 20)
+        assert any(text.startswith("the checkpoint has been writing for ") for text in status().problems)
+        learner.stop.set()
+        outcome = learner.join()
+        assert (outcome.finished, outcome.saved) == (False, False)
+        assert count("the last checkpoint, at ") == 1
+        assert checkpoints(tmp_path / "run") == saved
+    finally:
+        back.set()
+    assert load_newest(tmp_path / "run").policy.directory == saved[0]
+    actor.stop.set()
+    actor.join()
 
 
 def test_run_that_finished_during_a_rollout_of_an_earlier_epoch_is_over(
