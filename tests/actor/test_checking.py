@@ -406,8 +406,8 @@ def test_bounds_that_say_nothing_about_useful_actions_are_noted(
 
 
 def precision_warnings(shown: list[Any], space: str, **kwargs: Any) -> tuple[str, ...]:
-    spec = EnvironmentSpec(id="faulty_environments:Showing-v0", kwargs={"shown": shown, "space": space, **kwargs})
-    modules = UserModules(frozenset({"faulty_environments"}))
+    spec = EnvironmentSpec(id="showing_environments:Showing-v0", kwargs={"shown": shown, "space": space, **kwargs})
+    modules = UserModules(frozenset({"showing_environments"}))
     report = check_environment(spec, modules, seconds=60.0, env_steps=len(shown) - 1)
     assert report.problems == ()
     return tuple(warning for warning in report.warnings if "float32" in warning)

@@ -411,8 +411,8 @@ def test_one_number_that_is_not_finite_spoils_at_most_two_rollouts(
     """Three in a row quarantine an actor. Episodes have 10 steps, only the first environment is at fault."""
     shown: list[Any] = [1.0] * 11
     shown[place] = number
-    spec = EnvironmentSpec(id="faulty_environments:Showing-v0", kwargs={"shown": shown}, frame_stack=frame_stack)
-    modules = UserModules(frozenset({"faulty_environments"}))
+    spec = EnvironmentSpec(id="showing_environments:Showing-v0", kwargs={"shown": shown}, frame_stack=frame_stack)
+    modules = UserModules(frozenset({"showing_environments"}))
     collector = started_collector(spec, Summing(), count=2, rollout_length=rollout_length, modules=modules)
     rollouts = [copy.deepcopy(collect(collector)) for _ in range(16 // rollout_length)]
     spoilt = [_unfit(rollout) for rollout in rollouts]
@@ -424,11 +424,11 @@ def test_one_number_that_is_not_finite_spoils_at_most_two_rollouts(
 
 
 def _showing_vector(oddity: str) -> EnvironmentSpec:
-    return EnvironmentSpec(id="faulty_environments:ShowingVector-v0", kwargs={"shown": [0, 0, 0], "oddity": oddity})
+    return EnvironmentSpec(id="showing_environments:ShowingVector-v0", kwargs={"shown": [0, 0, 0], "oddity": oddity})
 
 
 def test_rewards_of_a_step_that_only_resets_do_not_count(caplog: pytest.LogCaptureFixture) -> None:
-    modules = UserModules(frozenset({"faulty_environments"}))
+    modules = UserModules(frozenset({"showing_environments"}))
     collector = started_collector(_showing_vector("rewards"), PlainPolicy(), rollout_length=9, modules=modules)
     rollout = collect(collector)
     assert rollout.rewards[:, 0].tolist() == [1, 1, 0] * 3
@@ -438,7 +438,7 @@ def test_rewards_of_a_step_that_only_resets_do_not_count(caplog: pytest.LogCaptu
 
 
 def test_an_episode_that_ends_in_a_step_that_only_resets_is_refused() -> None:
-    modules = UserModules(frozenset({"faulty_environments"}))
+    modules = UserModules(frozenset({"showing_environments"}))
     collector = started_collector(_showing_vector("flags"), PlainPolicy(), rollout_length=9, modules=modules)
     with pytest.raises(EnvironmentSetupError, match="environment 0 ends an episode in the step after an episode's end"):
         collect(collector)
@@ -452,8 +452,8 @@ def test_state_of_the_interpreter_that_an_environment_sets_is_its_own(
     monkeypatch.setattr(USER_STATE, "_theirs", None)  # for the next tests, too
     before = np.geterr(), list(warnings.filters), sys.stdout, signal.getsignal(signal.SIGTERM)
     kwargs = {"shown": [0, 1e-42, 1e300, 1.0, 0], "space": "float64"}
-    spec = EnvironmentSpec(id="faulty_environments:Strict-v0", kwargs=kwargs, processes=processes)
-    modules = UserModules(frozenset({"faulty_environments"}))
+    spec = EnvironmentSpec(id="showing_environments:Strict-v0", kwargs=kwargs, processes=processes)
+    modules = UserModules(frozenset({"showing_environments"}))
     collector = started_collector(spec, PlainPolicy(), count=2, rollout_length=4, modules=modules)
     assert collect(collector).frames["observation"][:, 0, 0].tolist() == pytest.approx([0, 0, np.inf, 1.0, 0])
     collector.close()

@@ -147,11 +147,11 @@ def test_a_reward_that_is_not_finite_ends_the_evaluation() -> None:
         play_episodes(AlwaysZero(), environments, 2, 1, sampled=False)
 
 
-SHOWING = UserModules(frozenset({"faulty_environments"}))
+SHOWING = UserModules(frozenset({"showing_environments"}))
 
 
 def showing(shown: list[Any], name: str = "Showing-v0", **kwargs: Any) -> EnvironmentSpec:
-    return EnvironmentSpec(id=f"faulty_environments:{name}", kwargs={"shown": shown, **kwargs})
+    return EnvironmentSpec(id=f"showing_environments:{name}", kwargs={"shown": shown, **kwargs})
 
 
 @pytest.mark.parametrize("name", ["Showing-v0", "ShowingVector-v0"])

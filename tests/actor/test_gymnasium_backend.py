@@ -552,8 +552,8 @@ def test_number_that_the_dtype_of_its_space_cannot_hold_is_refused(
     space: str, dtype: str, number: Any, reason: str, processes: bool
 ) -> None:
     kwargs = {"shown": [0, number, 0], "space": space, "dtype": dtype}
-    spec = EnvironmentSpec(id="faulty_environments:Showing-v0", kwargs=kwargs, processes=processes)
-    environments = created(spec, 2, modules=UserModules(frozenset({"faulty_environments"})))
+    spec = EnvironmentSpec(id="showing_environments:Showing-v0", kwargs=kwargs, processes=processes)
+    environments = created(spec, 2, modules=UserModules(frozenset({"showing_environments"})))
     try:
         environments.reset(1)
         with pytest.raises(EnvironmentSetupError, match=f"Showing-v0: step returns an observation .*{reason}"):

@@ -15,7 +15,7 @@ from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.outbox import Outbox
 from daedalus.gateway.policy_versions import PolicyVersion
-from daedalus.policy.acting.noise import Noise, NoiseSize
+from daedalus.policy.acting.noise import Noise, NoiseSize, neutral_noise
 from daedalus.policy.acting.runtime import Choice
 
 
@@ -120,7 +120,7 @@ class Choosing(WaitingClient):
 
     def begin_row(self) -> RowInputs:
         one = np.full((1, 1), self.number, np.float32)
-        return RowInputs({"o": one}, one + 1000.0, {"a": one + 2000.0}, one + 3000.0)
+        return RowInputs({"o": one}, one + 1000.0, {"a": one + 2000.0}, one + 3000.0, neutral_noise(NoiseSize(1, 1), 1))
 
     def take(self, choice: Choice) -> bool:
         parts = [*choice.actions.values(), choice.log_probs, choice.state]
