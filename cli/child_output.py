@@ -12,8 +12,9 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Self
 
 from daedalus.policy.saving.regular_files import append_own
 
@@ -67,7 +68,7 @@ class OutputLog:
     def __init__(self, path: Path) -> None:
         """Create no file before the first line."""
         self._path, self._bytes = path, 0
-        self._file: BinaryIO | None = None
+        self._file: FileIO | None = None
 
     def write(self, lines: Sequence[bytes]) -> None:
         """Append lines."""
