@@ -13,8 +13,9 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Self
 
 from daedalus.policy.saving.regular_files import append_own
 
@@ -74,7 +75,7 @@ class OutputLog:
     def __init__(self, path: Path) -> None:
         """Create no file before the first line."""
         self._path, self._bytes = path, 0
-        self._file: BinaryIO | None = None
+        self._file: FileIO | None = None
         self._waiting: queue.Queue[Sequence[bytes] | None] = queue.Queue(_WAITING_WRITES)
         self._thread: threading.Thread | None = None
         self._left_out = 0  # lines

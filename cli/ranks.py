@@ -2,12 +2,11 @@
 
 import argparse
 import os
-import shutil
 import subprocess
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -22,6 +21,7 @@ from daedalus.learner.ranks.opening import lead, no_other_ranks
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, allow_settings, modules_of
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.private_address import private_folder
 
 if TYPE_CHECKING:
     from daedalus.learner.ranks.leader import OtherRanks
@@ -63,10 +63,10 @@ class StartedRanks(RankProcesses):
         self._processes: list[subprocess.Popen[bytes]] = []
         self._connected = False
         self._statuses: list[int | None] = []  # of the other ranks when one was lost
-        self._folder = Path()
+        self._folder, self._stack = Path(), ExitStack()
 
     def __enter__(self) -> Self:
-        self._folder = Path(tempfile.mkdtemp(prefix="daedalus-ranks-"))
+        self._folder = Path(self._stack.enter_context(private_folder()))
         with inherited("") as streams:
             for rank in range(1, self._number):
                 place = ("--rank", str(rank), "--processes", str(self._number), "--folder", str(self._folder))
@@ -81,7 +81,7 @@ class StartedRanks(RankProcesses):
         elif self._connected:
             self._await(_END_SECONDS, lambda: all(process.poll() is not None for process in self._processes))
         self._kill()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._stack.close()
 
     def open(self, spec: RunSpec, stop: threading.Event) -> "OtherRanks | None":
         """See daedalus.learner.ranks.opening.OpenRanks."""

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import tempfile
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.hub import LIMITS, HubError, check_repository, hub_api, hub_errors
 from daedalus.policy.saving.saved_policy import SavedPolicy, export_policy, find_policy
 from daedalus.policy.saving.sealed import MANIFEST
+from daedalus.transport.private_address import private_folder
 
 _logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ def push(directory: Path, repository: str, *, private: bool) -> str:
 
 def policy_files(record: RunRecord, policy: SavedPolicy, repository: str) -> dict[str, bytes]:
     """Return the files of the repository by their names. Raises DamagedError, RunDataError."""
-    with tempfile.TemporaryDirectory(prefix="daedalus-push-") as folder:
+    with private_folder() as folder:
         exported = Path(folder) / "policy"
         export_policy(policy.directory, exported)
         files = {name: (exported / name).read_bytes() for name in LIMITS}

@@ -66,7 +66,7 @@ class CsvWriter:
             for cells in rows:
                 new.write(_line([*cells, *[""] * len(names)]))
         self._file.close()
-        self._file = open(self._path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+        self._file = append_own(self._path)
         self._columns = columns
 
     def close(self) -> None:

@@ -8,6 +8,7 @@ whoever writes into an existing run directory asks `foreign_entry` first, and op
 import errno
 import os
 import stat
+from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -50,7 +51,7 @@ def open_own(path: str | Path, flags: int, mode: int = 0o666) -> int:
     return descriptor
 
 
-def append_own(path: Path) -> BinaryIO:
+def append_own(path: Path) -> FileIO:
     """Open a file of a run directory to append to it, unbuffered. See `open_own`."""
     return open(path, "ab", buffering=0, opener=open_own)
 

@@ -3,6 +3,7 @@
 import os
 import stat
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -31,6 +32,51 @@ def test_private_folder_belongs_to_this_user_alone_and_is_removed() -> None:
         check_connecting([address], tls=False)
         listen([address]).close()
     assert not folder.exists()
+
+
+KILLED = """
+import os, signal
+from daedalus.transport.private_address import private_folder
+with private_folder() as folder:
+    open(os.path.join(folder, "learner"), "w").close()
+    print(folder, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+WITH_ENVIRONMENTS = """
+import os, signal
+from gymnasium.envs.classic_control import CartPoleEnv
+from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+EnvironmentProcesses("CartPole-v1", [CartPoleEnv])
+print("made", flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("program", [KILLED, WITH_ENVIRONMENTS])
+def test_folders_of_killed_processes_are_removed_by_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with private_address() as address:
+        alive = path_of(address).parent
+        subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+        (dead,) = (entry for entry in tmp_path.iterdir() if entry != alive)
+        assert dead.name.startswith("daedalus-")
+        home, theirs, unknown = tmp_path / "home", tmp_path / "daedalus-link", tmp_path / "daedalus-unknown"
+        for folder in (home, unknown):
+            folder.mkdir(mode=0o700)
+        (home / "lock").touch(0o600)
+        theirs.symlink_to(home)
+        (dead / "link").symlink_to(home)
+
+        def cleaned() -> bool:  # the server of multiprocessing ends a moment later
+            with private_address():
+                return not dead.exists()
+
+        until(cleaned)
+        assert {entry.name for entry in tmp_path.iterdir()} == {alive.name, home.name, theirs.name, unknown.name}
+        assert (home / "lock").exists()
 
 
 def test_private_path_is_short_enough_in_a_deep_temporary_folder(
