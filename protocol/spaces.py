@@ -32,7 +32,7 @@ def unfit_number(values: np.ndarray) -> str:
     if not (np.isfinite(low) and np.isfinite(high)):
         return f"has a value that is not finite ({values[~np.isfinite(values)][0]})"
     beyond = low if low < -LARGEST_OBSERVATION else high
-    return f"has a value beyond +-{LARGEST_OBSERVATION:g} ({beyond:g}): scale or clip the observations"
+    return f"has a value beyond +-{LARGEST_OBSERVATION:g}: scale or clip the observations (it is {beyond:g})"
 
 
 ComponentName = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,64}$")]

@@ -161,7 +161,7 @@ def showing(shown: list[Any], name: str = "Showing-v0", **kwargs: Any) -> Enviro
         ([0, "nan", 0, 0], {}, "component 'observation' has a value that is not finite (nan), in environment 0"),
         (["-inf", 0, 0], {}, "has a value that is not finite (-inf)"),
         ([0, 1e300, 0], {"space": "float64"}, "has a value that is not finite (inf)"),
-        ([0, 1e16, 0], {"space": "float64"}, "has a value beyond +-1e+15 (1e+16)"),
+        ([0, 1e16, 0], {"space": "float64"}, "beyond +-1e+15: scale or clip the observations (it is 1e+16)"),
         ([0, 300, 0], {"space": "int8", "dtype": "int64"}, "has the value 300, but its space has dtype int8"),
         ([0, -1, 0], {"space": "uint8", "dtype": "int64"}, "dtype"),
         ([0, 0, 0], {"rewards": [0, "inf", 0]}, "the reward inf in episode 1"),
