@@ -445,7 +445,7 @@ def test_a_resumed_run_undoes_what_came_after_its_checkpoint(tmp_path: Path) -> 
     assert 40.0 in scores
     assert 400.0 not in scores
     assert not (run / "evaluation.json").exists()
-    (event,) = [event for event in read_events(run) if "resumed" in event.text]
+    (event,) = [event for event in read_events(run) if event.text.startswith("resumed: ")]
     assert "undone are 2 rows of metrics.csv" in event.text
 
 

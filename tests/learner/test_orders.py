@@ -55,7 +55,7 @@ def test_operator_orders_a_checkpoint_then_the_end(network: MemoryNetwork, tmp_p
     assert checkpoints(tmp_path / "run") == []
     answer = operator.order(OrderRequest(order="checkpoint"))
     assert isinstance(answer, Acknowledgement)
-    assert re.fullmatch(r"checkpoint saved at \d+ env_steps", answer.reason)
+    assert re.fullmatch(r"checkpoint saved at [\d,]+ env_steps", answer.reason)
     assert checkpoints(tmp_path / "run")  # it is there when the answer says so
     assert not learner.ended
     assert operator.order(OrderRequest(order="stop")) == Acknowledgement(verdict="accepted")
