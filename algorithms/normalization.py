@@ -130,7 +130,7 @@ class ConfirmedRange:
 
     def add(self, actor: str, moments: Moments) -> None:
         """Add the moments of a rollout as a vote of its actor."""
-        if not moments.number:
+        if not moments.number or not np.isfinite(_magnitude(moments)).all():
             return
         voter = self._voters.pop(actor, None) or _Voter(self._votes)
         self._heard += 1
@@ -169,7 +169,7 @@ class ConfirmedRange:
         magnitude = np.sqrt(mean**2 + variance)
         unconfirmed = (magnitude > np.minimum(_LARGEST_RATIO * summary.shown, _FAR * summary.recent)) & (count > 0)
         if unconfirmed.any():
-            moments.forget(torch.from_numpy(unconfirmed & (summary.rows >= count / _RECENT)))
+            moments.forget(torch.from_numpy(np.asarray(unconfirmed & (summary.rows >= count / _RECENT))))
 
     def shares(self, moments: Moments, past: RunningMoments | None) -> tuple[np.ndarray, np.ndarray]:
         """Return c and f of the moments of a rollout, each [*shape]; `past`: what they are about to be added to."""
@@ -196,7 +196,7 @@ class ConfirmedRange:
         center, shares = self.shares(moments, past)
         if (shares == 1.0).all():
             return moments
-        share, middle = torch.from_numpy(shares), torch.from_numpy(center)
+        share, middle = torch.from_numpy(np.asarray(shares)), torch.from_numpy(np.asarray(center))
         mean = torch.where(share < 1.0, middle + share * (moments.mean - middle), moments.mean)
         # Squares are a sum over the rows, which are fewer as well.
         return Moments(moments.number * share, mean, share**3 * moments.squares)

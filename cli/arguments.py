@@ -37,6 +37,16 @@ def add_tls(options: argparse._ActionsContainer) -> None:
     )
 
 
+def add_reset_statistics(options: argparse._ActionsContainer, only: str = "") -> None:
+    """Add --reset-statistics to a parser; `only` says when it may be used."""
+    options.add_argument(
+        "--reset-statistics",
+        action="store_true",
+        help=f"{only}forget the sizes of observations and rewards that the checkpoint has, which the next rollouts "
+        "then define anew: for a run that a broken sensor has spoiled",
+    )
+
+
 def add_processes(options: argparse._ActionsContainer) -> None:
     """Add --processes, the number of processes of a learner; None if it is not given."""
     options.add_argument(

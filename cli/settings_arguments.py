@@ -12,6 +12,7 @@ from daedalus.cli.arguments import (
     add_allow_module,
     add_insecure,
     add_processes,
+    add_reset_statistics,
     add_tls,
     command_parser,
     whole_number,
@@ -248,6 +249,8 @@ def choose_run(arguments: argparse.Namespace) -> ChosenRun:
     Modules that the command line itself names are allowed; those that only an existing config.toml names need
     --allow-module. Raises SettingsError or UserModuleError.
     """
+    if arguments.reset_statistics and not arguments.resume:
+        raise SettingsError("--reset-statistics needs --resume: a new run has no statistics")
     named = arguments.preset is not None or arguments.env is not None
     directory = arguments.prepared or (_directory_to_resume(arguments) if arguments.resume else None)
     if directory is None:
@@ -313,6 +316,7 @@ def learner_parser() -> argparse.ArgumentParser:
         help="continue the run in --run-dir from its newest checkpoint, or start the run if there is none. "
         "For a supervisor that repeats the same command. Another --env-steps or --set changes the run from then on",
     )
+    add_reset_statistics(options, "with --resume: ")
     add_processes(options)
     add_allow_module(options, "config.toml of an existing run")
     add_tls(options)

@@ -43,7 +43,8 @@ def supervise_learner(directory: Path, arguments: argparse.Namespace, stopping: 
             raise SettingsError(f"run directory {directory}: {error.strerror}") from None
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
-        options = [*sys.argv[1:], "--run-dir", str(directory), *([] if first else ["--resume"])]
+        given = [word for word in sys.argv[1:] if first or word != "--reset-statistics"]
+        options = [*given, "--run-dir", str(directory), *([] if first else ["--resume"])]
         with inherited("learner") as streams:
             return start("daedalus.cli.commands.learner", *options, streams=streams)
 

@@ -83,6 +83,7 @@ class LearnerService:
         user_metrics: UserMetrics | None = None,
         open_ranks: OpenRanks = no_other_ranks,
         confirms: bool = False,
+        reset_statistics: bool = False,
     ) -> None:
         """Construct the service.
 
@@ -103,11 +104,13 @@ class LearnerService:
           user_metrics: metrics of the program that started the run.
           open_ranks: connects the other processes of the learner.
           confirms: whether a launcher plays new episodes to confirm that the target is reached.
+          reset_statistics: whether to forget the running statistics of the checkpoint.
         """
         self._spec, self._stop, self._progress = spec, stop, progress
         self._open_writers, self._modules, self._open_ranks = open_writers, modules, open_ranks
         self._restored, self._initial = restored, initial if restored is None else None
         self._allows_other_spaces = other_spaces
+        self._reset_statistics = reset_statistics
         self._ranks: OtherRanks | None = None  # None: not connected yet
         starts_before = restored.counters.get("starts", 0) if restored is not None else 0
         self._state = RunState(directory, spec, started, certificate_days_left, starts_before)
@@ -205,6 +208,9 @@ class LearnerService:
             if difference := other_network(policy, self._spec.policy, spaces):
                 raise CheckpointMismatchError(f"{policy.directory}: {difference}")
             learner.restore(policy.policy_version, policy.weights, self._restored.state)
+            if self._reset_statistics:
+                learner.reset_statistics()
+                _logger.info("statistics of observations and rewards reset: the next rollouts define them")
             if learner.learning_rate(self._state.progress) == 0.0:
                 _logger.warning(
                     "the learning rate has been annealed to 0: the policy changes no more; "

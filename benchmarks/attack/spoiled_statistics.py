@@ -4,8 +4,8 @@
 
 CartPole with the default settings and two honest actors. Early in the run a third one sends one rollout with
 observations of +-9e14, one with rewards of +-1e9, or 700 of the first kind, rejoining when it is quarantined; or, for
-half of the run, values a thousand times too large, which no quarantine ends. Each run must reach 95 % of the return
-that it has without the attack.
+half of the run, values a thousand times too large, which no quarantine ends. The run must reach 95 % of the return that
+it has without an attack. `make attack` does all of it in one run; the command above does each in a run of its own.
 """
 
 import sys
@@ -26,20 +26,18 @@ _MESSAGES = 700
 
 
 def spoiled_statistics() -> Verdict:
-    """Attack four runs, and return whether each has learned."""
-    returns = {kind.__name__: _attacked(kind) for kind in (observations, rewards, flood, broken_sensor)}
-    text = ", ".join(f"{name.replace('_', ' ')} {value:.0f}" for name, value in returns.items())
-    return Verdict(min(returns.values()) >= _RETURN, f"return after each attack, at least {_RETURN:g}: {text}")
+    """Attack one run in all ways, and return whether it has learned."""
+    value = _attacked(everything)
+    return Verdict(value >= _RETURN, f"return after all attacks {value:.0f}, at least {_RETURN:g}")
 
 
-def _attacked(attack: Callable[[HostileActor, Scene], object] | None) -> float:
+def _attacked(attack: Callable[[HostileActor, Scene], object]) -> float:
     with scene() as here:
         settings = ("--seed", 1, "--env-steps", _ENV_STEPS, "--set", "evaluation.final_episodes=1")
         run = here.start("train", "--env", "CartPole-v1", "--listen", here.address, "--run-dir", "run", *settings)
         here.wait("training", lambda: here.env_steps() > _BEGIN)
-        if attack is not None:
-            with closing(HostileActor(here.address, "hostile")) as hostile:
-                attack(hostile, here)
+        with closing(HostileActor(here.address, "hostile")) as hostile:
+            attack(hostile, here)
         here.wait("the end", lambda: run.process.poll() is not None)
         return read_json(here.folder / "run" / "summary.json")["episode_return_mean"]
 
@@ -77,7 +75,13 @@ def broken_sensor(hostile: HostileActor, here: Scene) -> None:
         hostile.send(**_frames(hostile, 1e3), rewards=1e3 * _signs(hostile)[1:, :, 0])
 
 
+def everything(hostile: HostileActor, here: Scene) -> None:
+    """Do all of it, one after the other."""
+    for attack in (observations, rewards, broken_sensor, flood):
+        attack(hostile, here)
+
+
 if __name__ == "__main__":
-    verdict = spoiled_statistics()
-    print(verdict)
-    sys.exit(0 if verdict.held else 1)
+    returns = {attack.__name__: _attacked(attack) for attack in (observations, rewards, flood, broken_sensor)}
+    print(f"return after each attack, at least {_RETURN:g}: {returns}")
+    sys.exit(0 if min(returns.values()) >= _RETURN else 1)

@@ -260,6 +260,7 @@ class _Command:
             user_metrics=self.user_metrics,
             open_ranks=self.ranks.open,
             confirms=self.arguments.confirm,
+            reset_statistics=self.arguments.reset_statistics,
         )
 
 

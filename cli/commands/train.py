@@ -11,6 +11,7 @@ from daedalus.cli.arguments import (
     add_allow_module,
     add_insecure,
     add_processes,
+    add_reset_statistics,
     add_tls,
     allowing,
     command_parser,
@@ -198,6 +199,7 @@ def resume_parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--env-steps", type=whole_number, metavar="N", help="new budget (default: the budget of the run)"
     )
+    add_reset_statistics(options)
     options.add_argument(
         "--set",
         action="append",
@@ -274,6 +276,7 @@ def _run(
         processes=parsed.processes or 1,
         init_from=init_from,
         resume=resume,
+        reset_statistics=resume and parsed.reset_statistics,
         trained=None if finished is None else _MISSED if finished.missed else 0,
         listen=parsed.listen,
         tls=parsed.tls,

@@ -35,6 +35,8 @@ def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
         arguments.append("--confirm")
     if run.resume or not first:
         arguments.append("--resume")
+    if run.reset_statistics and first:
+        arguments.append("--reset-statistics")
     return arguments
 
 

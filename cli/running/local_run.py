@@ -40,6 +40,7 @@ class LocalRun:
     started: float  # on the monotonic clock; the seconds of the run count from this time
     lock: tuple[int, ...] = ()  # descriptor of the run's lock, which the learner inherits and holds as long as it lives
     resume: bool = False
+    reset_statistics: bool = False  # of the checkpoint to resume from
     trained: int | None = None  # exit status of a run that is already trained and that only lacks its evaluation
     spaces: Spaces | None = None  # of the environment, if it was checked
     processes: int = 1  # of the learner

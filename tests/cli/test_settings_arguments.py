@@ -106,6 +106,8 @@ def test_a_learner_that_resumes_changes_the_settings_that_its_command_line_names
         longer = resumed(*words, "--env-steps", "9e6")
         assert longer.spec.training == spec.training.model_copy(update={"env_steps": 9_000_000})
         assert longer.changed == ["training.env_steps"]
+    with pytest.raises(SettingsError, match="--reset-statistics needs --resume"):
+        choose_run(learner_parser().parse_args(["cartpole", "--reset-statistics"]))
     for words, names in (
         (("--seed", "9"), "training.seed"),
         (("cartpole", "--algorithm", "a2c", "--set", "policy.hidden=[3]"), "policy.hidden, training.algorithm.*"),

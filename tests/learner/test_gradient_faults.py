@@ -29,7 +29,7 @@ from daedalus.protocol.spec import PolicySpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout
 
 RELU = PolicySpec(hidden=(8,), activation="relu")
-HUGE_REWARDS: dict[str, Any] = {"rewards": np.full((ROWS, ENVIRONMENTS), 1e30, np.float32)}
+HUGE_REWARDS: dict[str, Any] = {"rewards": np.full((ROWS, ENVIRONMENTS), np.inf, np.float32)}
 HUGE_FRAMES: dict[str, Any] = {"frames": np.full((ROWS + 1, ENVIRONMENTS, 3), 1e30, np.float32)}
 
 

@@ -10,6 +10,7 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.components import first_component_violation
+from daedalus.learner.serving.gradient_checks import restored
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.codec import encode
@@ -195,3 +196,50 @@ def test_the_size_of_a_gradient_is_bounded(harness: Harness) -> None:
     refused = harness.judge.refuse_size("a", 1 << 20)
     assert refused is not None
     assert refused.cause == "malformed"
+
+
+# ------------------------------------------------------------------------------------ what one actor cannot decide
+
+
+def of_actors(batch: int, **replaced: Any) -> list[Gradient]:
+    """Return a gradient of each of a, b and z, of which the last has something replaced."""
+    found = [replace(gradient(3 * batch + number), identity=identity(name)) for number, name in enumerate("abz")]
+    return [restored(each) for each in [*found[:2], replace(found[2], **replaced)]]
+
+
+def learner_after(*batches: list[Gradient]) -> Learner:
+    learner = Learner(SPEC.training, SPEC.policy, SPACES)
+    for batch in batches:
+        learner.apply(batch, 0.0)
+    return learner
+
+
+@pytest.mark.parametrize(
+    ("name", "replaced"),
+    [
+        ("returns", changed("moments", "returns", np.array([1e25, 1e3]))),
+        ("observations/observation", changed("moments", "observations/observation", np.full((2, 3), 1e29))),
+        ("gradient norm", {"gradient": {name: each * 0 + 1e10 for name, each in restored(GOOD).gradient.items()}}),
+        ("metrics/value_loss", changed("metrics", "value_loss", np.array(1e30, np.float32))),
+    ],
+)
+def test_a_gradient_far_outside_those_of_other_actors_is_left_out_and_named(name: str, replaced: Any) -> None:
+    ordinary = [of_actors(batch) for batch in range(2)]
+    bad = of_actors(2, **{part: {k: np.asarray(v) for k, v in content.items()} for part, content in replaced.items()})
+    ours, theirs = learner_after(*ordinary, bad), learner_after(*ordinary, bad[:2])
+    assert ours.far_outside == {bad[2]: name}
+    for parameter, values in ours.weights().items():
+        np.testing.assert_array_equal(values, theirs.weights()[parameter])
+    assert abs(ours.metrics.take_means()["value_loss"]) < 1e3
+
+
+def test_the_norm_of_one_actors_gradient_counts_little_if_nobody_confirms_it() -> None:
+    """It has the opposite direction of the others, and 1,000 times their norm."""
+    ordinary = [of_actors(batch) for batch in range(2)]
+    mean = ordinary[0][0].gradient
+    large = {name: -1000.0 * values for name, values in mean.items()}
+    learner = learner_after(*ordinary)
+    bad = of_actors(2, gradient=large)
+    learner.apply(bad, 0.0)
+    assert learner.far_outside == {}
+    assert learner.metrics.take_means()["gradient_norm"] < 30 * bad[0].norm

@@ -503,9 +503,9 @@ def test_restore_refuses_statistics_of_another_optimiser(wrote: str, reads: str,
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
-@pytest.mark.parametrize("reward", [3e38, np.nan])
+@pytest.mark.parametrize("reward", [np.inf, np.nan])
 def test_update_is_skipped_and_counted_when_its_gradient_is_not_finite(algorithm: str, reward: float) -> None:
-    """Intake rejects nan, but finite rewards may still be too large for a finite gradient."""
+    """Intake rejects such rewards, but an algorithm of the user may have a loss that is not finite."""
     learner = make_learner(algorithm=algorithm, passes=2, minibatches=1)
     learner.step(make_rollouts(1), 0.0)
     learner.metrics.take_means()
@@ -590,3 +590,78 @@ def test_share_of_clipped_gradients_counts_updates() -> None:
     assert metrics.take_means()["gradient_clipped_fraction"] == 0.4
     metrics.add_update(terms, 1.0, clipped=True)
     assert metrics.take_means()["gradient_clipped_fraction"] == 1.0
+
+
+def test_checkpoints_of_earlier_releases_have_one_count_for_all_numbers(tmp_path: Path) -> None:
+    learner = make_learner(NORMALIZED, algorithm="a2c", normalize_rewards=True)
+    learner.step(consecutive_rollouts(0), 0.0)
+    state = learner.state()
+    count = state["observations/observation/count"][0].clone()
+    again = make_learner(NORMALIZED, algorithm="a2c", normalize_rewards=True, seed=9)
+    again.restore(1, weights(learner), {**state, "observations/observation/count": count})
+    for name, value in again.state().items():
+        assert torch.equal(value, state[name]), name
+
+
+def test_reset_statistics_are_defined_by_the_next_rollouts() -> None:
+    learner = make_learner(NORMALIZED, algorithm="a2c", normalize_rewards=True)
+    spoiled = [replace(each, frames={NAME: plain(each.frames) * 1e6}) for each in consecutive_rollouts(0)]
+    learner.step(spoiled, 0.0)
+    learner.reset_statistics()
+    assert not learner.state()["returns/count"]
+    assert (learner.weights()["normalizer.scales.0"] == 1.0).all()
+    learner.step(consecutive_rollouts(1), 0.0)
+    assert (learner.weights()["normalizer.scales.0"] > 0.1).all()
+
+
+# ---------------------------------------------------------------------------------- rollouts far outside the others
+
+FAR: dict[str, dict[str, Any]] = {
+    "observations/observation": {"frames": {NAME: np.full((7, 3, 3), -9e14, np.float32)}},
+    "returns": {"rewards": np.full((6, 3), 1e9, np.float32)},
+}
+
+
+def of_actors(batch: int, **replaced: Any) -> list[Rollout]:
+    """Return a rollout of each of a, b and z, of which the last has something replaced."""
+    rollouts = [make_rollout(identity(name, batch), seed=3 * batch + number) for number, name in enumerate("abz")]
+    return [*rollouts[:2], replace(rollouts[2], **replaced)]
+
+
+@pytest.mark.parametrize("normalized", [True, False])
+@pytest.mark.parametrize("component", FAR)
+def test_a_rollout_far_outside_those_of_other_actors_is_left_out_and_named(component: str, normalized: bool) -> None:
+    policy, settings = (NORMALIZED, {"normalize_rewards": True}) if normalized else (POLICY, {})
+    ours, theirs = (make_learner(policy, algorithm="a2c", **settings) for _ in range(2))
+    for batch in range(3):
+        for learner in (ours, theirs):
+            learner.step(of_actors(batch), 0.0)
+    bad = of_actors(3, **FAR[component])
+    assert ours.step(bad, 0.0) == []
+    name = component if normalized or component != "returns" else "rewards"
+    assert ours.far_outside == {bad[2]: name}
+    theirs.step(bad[:2], 0.0)
+    assert_same(weights(ours), weights(theirs))
+    ours.step(of_actors(4), 0.0)
+    assert ours.far_outside == {}
+    assert ours.updates_skipped == 0
+
+
+def test_a_single_actor_is_never_far_outside() -> None:
+    learner = make_learner(NORMALIZED, algorithm="a2c", normalize_rewards=True)
+    for sequence in range(6):
+        bad = FAR["returns"] | FAR["observations/observation"] if sequence >= 3 else {}
+        learner.step([replace(make_rollout(identity("a", sequence), seed=sequence), **bad)], 0.0)
+        assert learner.far_outside == {}
+    assert learner.updates_skipped == 0
+
+
+def test_rewards_that_nobody_confirms_count_little_in_the_batch() -> None:
+    """Clipped to 10 deviations, rewards of a thousand would still decide the advantages of the whole batch."""
+    learner = make_learner(NORMALIZED, algorithm="a2c", normalize_rewards=True, learning_rate=1e-9)
+    losses = []
+    for batch in range(8):
+        bad = {"rewards": np.full((6, 3), 1e4, np.float32)} if batch == 7 else {}
+        learner.step(of_actors(batch, **bad), 0.0)
+        losses.append(learner.metrics.take_means()["value_loss"])
+    assert losses[-1] < 60 * max(losses[:-1])

@@ -165,6 +165,11 @@ HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
             9,
             ("batches do not wait for a, b, c, d, e and 2 more: connected, but without rollouts",),
         ),
+        (
+            {"far_outside": {"b": ("returns", 50.0), "a": ("observations/position", 60.0), "c": ("returns", 44.0)}},
+            3,
+            ("rollouts with numbers far outside those of other actors: a (observations/position), b (returns)",),
+        ),
         ({"save_fault": "No space left"}, 1, ("checkpoints cannot be saved: No space left",)),
     ],
 )
