@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Self
 
+from daedalus.protocol.redaction import without_secrets
+
 STREAMS = ("stdout", "stderr")
 
 _LONGEST_LINE = 1 << 16  # bytes; a longer line is split
@@ -71,7 +73,7 @@ class OutputLog:
         """Append lines."""
         with suppress(OSError):
             if self._file is None:
-                self._file = open(self._path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+                self._file = open(self._path, "ab", buffering=0, opener=_private)  # noqa: SIM115 - closed in close()
                 self._bytes = self._file.tell()
             data = b"".join(lines)
             self._file.write(data)
@@ -85,6 +87,11 @@ class OutputLog:
         if self._file is not None:
             self._file.close()
         self._file = None
+
+
+def _private(path: str, flags: int) -> int:
+    """Open a file that only its owner may read: programs print what was not meant for others."""
+    return os.open(path, flags, 0o600)
 
 
 class ChildOutput:
@@ -270,4 +277,4 @@ class _Reader:
         self._pass(lines)
 
     def _pass(self, lines: Sequence[bytes]) -> None:
-        self._take([line.decode(errors="replace") for line in lines])
+        self._take([without_secrets(line.decode(errors="replace")) for line in lines])

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from daedalus.protocol import keys
+from daedalus.protocol.redaction import without_secrets
 from daedalus.protocol.timestamps import utc
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # all but tab and newline
@@ -75,8 +76,8 @@ def _print(line: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return `text` with control characters escaped: it may come from a peer, and a terminal would obey them."""
-    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+    """Return `text` without secrets, and with control characters escaped: a terminal would obey those of a peer."""
+    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", without_secrets(text))
 
 
 def one_line(text: str) -> str:

@@ -1,16 +1,18 @@
 """Texts for a person who reads them: those of peers, bounded, and numbers. Pure functions."""
 
+from daedalus.protocol.redaction import without_secrets
+
 MAX_NAME, MAX_TEXT = 64, 300  # bytes in UTF-8: of a name, and of a reason or an event
 MAX_ANSWER_TEXT = 1000  # bytes in UTF-8: of the reason in an answer to this process
 
 
 def bounded_text(text: str, most: int = MAX_TEXT) -> str:
-    """Return a foreign text in one line, without unprintable characters, cut to `most` bytes in UTF-8.
+    """Return a foreign text in one line, without secrets and unprintable characters, cut to `most` bytes in UTF-8.
 
     An unprintable character becomes a space, and several spaces become one. Whatever a peer sends, a learner can then
     keep the text, log it, and report it within the limits of its readers, which count bytes.
     """
-    start = text[:most]
+    start = without_secrets(text[: 4 * most])[:most]
     printable = "".join(character if character.isprintable() else " " for character in start)
     return " ".join(printable.split()).encode()[:most].decode(errors="ignore")
 
