@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Self
 
 from daedalus.policy.saving.regular_files import append_own
+from daedalus.protocol.redaction import without_secrets
 
 STREAMS = ("stdout", "stderr")
 
@@ -108,7 +109,7 @@ class OutputLog:
 
     def _append(self, data: bytes) -> None:
         if self._file is None:
-            self._file = append_own(self._path)
+            self._file = append_own(self._path, private=True)
             self._bytes = self._file.tell()
         self._file.write(data)
         self._bytes += len(data)
@@ -305,4 +306,4 @@ class _Reader:
         self._pass(lines)
 
     def _pass(self, lines: Sequence[bytes]) -> None:
-        self._take([line.decode(errors="replace") for line in lines])
+        self._take([without_secrets(line.decode(errors="replace")) for line in lines])

@@ -7,12 +7,15 @@ for the bytes of a file's name, and what Unicode has not assigned. Whatever reac
 through one of these functions.
 """
 
+from daedalus.protocol.redaction import without_secrets
+
 MAX_NAME, MAX_TEXT = 64, 300  # bytes in UTF-8: of a name, and of a reason or an event
 MAX_ANSWER_TEXT = 1000  # bytes in UTF-8: of the reason in an answer to this process
 
 
 def printable(text: str) -> str:
-    """Return a text with every character that is not printable escaped, except newlines and tabs."""
+    """Return a text without secrets, and with every character that is not printable escaped but newlines and tabs."""
+    text = without_secrets(text)
     if text.isprintable():
         return text
     return "".join(
@@ -30,12 +33,12 @@ def one_line(text: str) -> str:
 
 
 def bounded_text(text: str, most: int = MAX_TEXT) -> str:
-    """Return a foreign text in one line, without unprintable characters, cut to `most` bytes in UTF-8.
+    """Return a foreign text in one line, without secrets and unprintable characters, cut to `most` bytes in UTF-8.
 
     An unprintable character becomes a space, and several spaces become one. Whatever a peer sends, a learner can then
     keep the text, log it, and report it within the limits of its readers, which count bytes.
     """
-    start = text[:most]
+    start = without_secrets(text[: 4 * most])[:most]
     printable = "".join(character if character.isprintable() else " " for character in start)
     return " ".join(printable.split()).encode()[:most].decode(errors="ignore")
 

@@ -10,11 +10,13 @@ from typing import Any
 from daedalus.cli.comparing.recorded_run import SECONDS, one_run, read_run
 from daedalus.cli.hub.model_card import model_card
 from daedalus.cli.reports.run_record import RunRecord, read_record, record_command
+from daedalus.learner.reporting.trackers.tracker import flat
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, METRICS, VERSIONS
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.hub import LIMITS, HubError, check_repository, hub_api, hub_errors
 from daedalus.policy.saving.saved_policy import SavedPolicy, export_policy, find_policy
 from daedalus.policy.saving.sealed import MANIFEST
+from daedalus.protocol.redaction import is_secret
 from daedalus.transport.private_address import private_folder
 
 _logger = logging.getLogger(__name__)
@@ -69,7 +71,13 @@ def push(directory: Path, repository: str, *, private: bool) -> str:
 
 
 def policy_files(record: RunRecord, policy: SavedPolicy, repository: str) -> dict[str, bytes]:
-    """Return the files of the repository by their names. Raises DamagedError, RunDataError."""
+    """Return the files of the repository by their names. Raises DamagedError, HubError, RunDataError."""
+    for name, value in flat(policy.spec.model_dump(mode="json")):
+        if isinstance(value, str | list) and is_secret(name.rpartition(".")[2], str(value)):
+            raise HubError(
+                f"{name} holds a password or a token, which would be published: train without it in the settings (let "
+                "the environment read it from a variable), and push that run"
+            )
     with private_folder() as folder:
         exported = Path(folder) / "policy"
         export_policy(policy.directory, exported)

@@ -21,6 +21,7 @@ from daedalus.learner.run.event_file import RecordedEvent, read_events
 from daedalus.learner.run.run_directory import EVALUATION, EVENTS, OUTPUT, VERSIONS
 from daedalus.learner.run.run_files import RunDataError, read_json
 from daedalus.policy.saving.regular_files import open_regular
+from daedalus.protocol.redaction import without_secrets
 
 _MAX_OUTPUT_BYTES = 16 << 10
 _VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
@@ -151,7 +152,7 @@ def _end_of(path: Path) -> str:
     try:
         with open_regular(path) as file:
             file.seek(max(os.fstat(file.fileno()).st_size - _MAX_OUTPUT_BYTES, 0))
-            return file.read(_MAX_OUTPUT_BYTES).decode("utf-8", "replace").strip()
+            return without_secrets(file.read(_MAX_OUTPUT_BYTES).decode("utf-8", "replace").strip())
     except OSError:
         return ""
 

@@ -17,6 +17,7 @@ from daedalus.cli.reports.failures import failed_events, failure_counts, togethe
 from daedalus.cli.reports.markup import Child, Html, element, table
 from daedalus.cli.reports.run_record import RecordedEvaluation, RunRecord, finite, record_command
 from daedalus.learner.run.run_directory import CONFIG
+from daedalus.protocol.redaction import without_secrets
 
 MAX_VIDEO_BYTES = 32 << 20
 _MOST_EVENTS = 200
@@ -219,7 +220,7 @@ def settings_section(record: RunRecord) -> Html:
 
 def setting_text(value: object) -> str:
     """Return the value of a setting as text of limited length."""
-    shown = text(value) if not isinstance(value, dict | list) else json.dumps(value)
+    shown = without_secrets(text(value) if not isinstance(value, dict | list) else json.dumps(value))
     return shown if len(shown) <= 400 else f"{shown[:400]}..."
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from daedalus.learner.run.run_directory import EVENTS
 from daedalus.policy.saving.regular_files import append_own, read_regular
+from daedalus.protocol.redaction import without_secrets
 from daedalus.protocol.status import Event
 from daedalus.protocol.timestamps import utc
 
@@ -45,7 +46,17 @@ class EventFile:
 
     def add_restart(self, text: str) -> None:
         """Append the restart of a process by the launcher."""
-        self._append([{"time": utc(time.time()), "kind": RESTARTED, "actor": "", "text": text[:_MAX_TEXT], "count": 1}])
+        self._append(
+            [
+                {
+                    "time": utc(time.time()),
+                    "kind": RESTARTED,
+                    "actor": "",
+                    "text": without_secrets(text)[:_MAX_TEXT],
+                    "count": 1,
+                }
+            ]
+        )
 
     def _append(self, events: Sequence[dict[str, Any]]) -> None:
         if not events:
@@ -65,5 +76,5 @@ def read_events(directory: Path) -> Iterator[RecordedEvent]:
     for line in lines:
         with suppress(ValueError, KeyError, TypeError, OverflowError, RecursionError):
             fields = json.loads(line)
-            texts = {name: str(fields[name])[:_MAX_TEXT] for name in ("time", "kind", "actor", "text")}
+            texts = {name: without_secrets(str(fields[name])[:_MAX_TEXT]) for name in ("time", "kind", "actor", "text")}
             yield RecordedEvent(**texts, count=max(int(fields["count"]), 1))

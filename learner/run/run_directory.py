@@ -1,4 +1,4 @@
-"""The directory of a run: its files, and functions that read and write them.
+"""The directory of a run: its files, and functions that read and write them. Only its owner may enter a new one.
 
 config.toml      all settings; reproduces the run      metrics.csv   one row for each log interval
 versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
@@ -86,7 +86,7 @@ def check_free(directory: Path) -> None:
 def made(directory: Path) -> Iterator[None]:
     """Make a directory before its run is created, and remove it at the end if it is empty. Raises SettingsError."""
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(f"run directory {directory}: {error.strerror}") from None
     try:
@@ -124,7 +124,7 @@ def create_locked(
         if numbered:
             directory = make_numbered(directory)
         check_free(directory)
-        directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(0o700, parents=True, exist_ok=True)
         lock = RunLock(directory)
         try:
             check_free(directory)  # another process may have held the lock before
@@ -146,7 +146,7 @@ def make_numbered(directory: Path) -> Path:
     for number in itertools.count(1):
         numbered = directory if number == 1 else directory.with_name(f"{directory.name}-{number}")
         with suppress(FileExistsError):
-            numbered.mkdir(parents=True)
+            numbered.mkdir(0o700, parents=True)
             return numbered
     raise AssertionError
 

@@ -230,7 +230,7 @@ class Checkpointer:
     def _restore_config(self) -> None:
         """Write config.toml again, without which nobody can resume the run. Raises OSError."""
         directory = self._state.directory
-        directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(0o700, parents=True, exist_ok=True)
         try:
             write_config(directory, self._spec)
         except SettingsError as error:

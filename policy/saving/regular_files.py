@@ -8,6 +8,7 @@ whoever writes into an existing run directory asks `foreign_entry` first, and op
 import errno
 import os
 import stat
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
@@ -51,9 +52,9 @@ def open_own(path: str | Path, flags: int, mode: int = 0o666) -> int:
     return descriptor
 
 
-def append_own(path: Path) -> FileIO:
-    """Open a file of a run directory to append to it, unbuffered. See `open_own`."""
-    return open(path, "ab", buffering=0, opener=open_own)
+def append_own(path: Path, *, private: bool = False) -> FileIO:
+    """Open a file of a run directory to append to it, unbuffered; a new one for its owner only. See `open_own`."""
+    return open(path, "ab", buffering=0, opener=partial(open_own, mode=0o600 if private else 0o666))
 
 
 def foreign_entry(directory: Path) -> str:

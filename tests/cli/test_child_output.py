@@ -198,3 +198,13 @@ def test_a_warning_of_every_environment_is_shown_once(screen: Screen) -> None:
     assert screen.err == ["old attribute", "", "other"]
     assert screen.out == []  # what was shown before does not count as withheld
     assert len(screen.log.read_text().splitlines()) == 41
+
+
+def test_secrets_reach_neither_the_screen_nor_the_log_which_only_its_owner_may_read(screen: Screen) -> None:
+    program = "import sys\nprint('at http://ada:pa55w0rd@host')\nprint('http://ada:pa55w0rd@host', file=sys.stderr)"
+    screen.run("mlflow", program)
+    assert screen.output.last_error("mlflow") == "http://***@host"
+    screen.output.close()
+    assert (screen.out, screen.err) == (["at http://***@host"], ["http://***@host"])
+    assert "pa55w0rd" not in screen.log.read_text()
+    assert screen.log.stat().st_mode & 0o777 == 0o600

@@ -90,3 +90,13 @@ def test_command_for_a_person_shows_messages_alone_and_only_events_that_need_att
 def test_control_characters_of_an_error_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
     print_error("actor", ValueError("no\x1b[2J"))
     assert capsys.readouterr().err == "daedalus actor: no\\x1b[2J\n"
+
+
+def test_secrets_are_hidden_in_log_lines_and_errors(lines: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    for as_json in (False, True):
+        configure_logging(as_json=as_json, write=lines.append)
+        logging.getLogger("daedalus.x").warning("%s", "mlflow: https://ada:pa55w0rd@host failed")
+    print_error("train", "https://ada:pa55w0rd@host")
+    shown = "".join([*lines, capsys.readouterr().err])
+    assert shown.count("https://***@host") == 3
+    assert "pa55w0rd" not in shown

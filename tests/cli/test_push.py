@@ -6,6 +6,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,21 @@ def test_a_private_repository_needs_the_token(hub: HubServer, monkeypatch: pytes
     monkeypatch.delenv("HF_TOKEN")
     with pytest.raises(HubError, match="no repository ada/secret on the Hub, or it is private: check the name; for a"):
         pull("ada/secret")
+
+
+@pytest.mark.parametrize("kwargs", [{"address": "http://ada:pa55w0rd@host"}, {"simulator": {"api_key": "abc123"}}])
+def test_a_password_in_the_settings_is_not_published(
+    hub: HubServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, kwargs: dict[str, Any]
+) -> None:
+    policy = find_policy(run_of(Path("run"), 1))
+    environment = policy.spec.environment.model_copy(update={"kwargs": kwargs})  # CartPole itself takes none
+    policy = replace(policy, spec=policy.spec.model_copy(update={"environment": environment}))
+    monkeypatch.setattr("daedalus.cli.hub.upload.find_policy", lambda *_: policy)
+    assert push(["run", "ada/cart"]) == 1
+    message = line(capsys)
+    assert f"environment.kwargs.{next(iter(kwargs))}" in message
+    assert "holds a password or a token" in message
+    assert "pa55w0rd" not in message
 
 
 def test_a_private_push_never_ends_in_a_public_repository(hub: HubServer, capsys: pytest.CaptureFixture[str]) -> None:

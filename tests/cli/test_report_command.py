@@ -418,3 +418,17 @@ def test_numbers_that_cannot_be_drawn_are_left_out(folder: Path, values: list[st
     (run / "metrics.csv").write_text("\n".join([f"{header},user/wild", *rows]) + "\n")
     assert report(["run"]) == 0
     assert not re.search(r'd="[^"]*(nan|inf)', (run / "report.html").read_text())
+
+
+def test_a_report_shows_no_password_also_of_a_run_of_an_earlier_release(folder: Path) -> None:
+    run = record(folder / "secretive")
+    secret = "mlflow: http://ada:pa55w0rd@host refused"
+    settings = tomllib.loads((run / "config.toml").read_text())
+    settings["environment"]["kwargs"] = {"at": secret}
+    (run / "config.toml").write_text(tomli_w.dumps(settings))
+    happened(run, ("started", "", "serving"), ("failed", "a", secret))
+    (run / "output.log").write_text(secret)
+    assert report(["secretive"]) == 0
+    page = (run / "report.html").read_text()
+    assert page.count("http://***@host") == 3
+    assert "pa55w0rd" not in page

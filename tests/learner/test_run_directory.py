@@ -2,6 +2,7 @@
 
 import errno
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,18 @@ def test_new_run_directory_contains_config_and_versions(tmp_path: Path) -> None:
     ]
     versions = run_directory.read_json(tmp_path / "runs" / "new" / run_directory.VERSIONS)
     assert {"python", "torch", "numpy", "eclipse-zenoh"} <= versions.keys()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no permissions")
+def test_only_its_owner_may_enter_a_new_run_directory(tmp_path: Path) -> None:
+    for numbered in (False, True):
+        run_directory.create_locked(tmp_path / "runs" / str(numbered), run_spec(), numbered=numbered).close()
+        assert (tmp_path / "runs" / str(numbered)).stat().st_mode & 0o777 == 0o700
+    with run_directory.made(tmp_path / "runs" / "made"):
+        assert (tmp_path / "runs" / "made").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "mine").mkdir(0o755)
+    run_directory.create_locked(tmp_path / "mine", run_spec()).close()
+    assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o755  # a directory of the user's stays as it is
 
 
 def test_existing_run_directory_is_refused_and_unchanged(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daedalus.protocol.redaction import without_secrets
 from daedalus.protocol.texts import bounded_text, one_line, printable, short_number
 
 offline = settings(max_examples=200, deadline=None, derandomize=True)
@@ -66,3 +67,40 @@ SHOWN = {0.0: "0", 1.2e-5: "1.2e-05", -0.0345: "-0.0345", 0.98765: "0.988", -475
 @pytest.mark.parametrize(("value", "text"), SHOWN.items())
 def test_numbers_of_any_size_have_three_digits_that_count(value: float, text: str) -> None:
     assert short_number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("ConnectError: http://ada:pa55w0rd@host:5000/api refused", "ConnectError: http://***@host:5000/api refused"),
+        ("postgresql+psycopg://u:a@b:c@db/x", "postgresql+psycopg://***@db/x"),
+        ("https://0123abcd@api.wandb.ai", "https://***@api.wandb.ai"),
+        ("GET /runs?page=2&access_token=abc123&x=1", "GET /runs?page=2&access_token=***&x=1"),
+        ("WANDB_API_KEY=0123456789 is not valid", "WANDB_API_KEY=*** is not valid"),
+        (
+            "{'Authorization': 'Bearer abcdefghijk', 'password': 'hunter2'}",
+            "{'Authorization': 'Bearer ***', 'password': '***'}",
+        ),
+        ("invalid token hf_abcdefghijklmnopqrst", "invalid token ***"),
+        ("key in-the-environment was refused", "key *** was refused"),
+        ("ada%3Ab!tter was refused", "ada%3Ab!tter was refused"),
+        ("db says: p@ss/word1 or p%40ss%2Fword1", "db says: *** or ***"),
+        (
+            "the token of client 'arm' is missing: daedalus certs token",
+            "the token of client 'arm' is missing: daedalus certs token",
+        ),
+        (
+            "training.learning_rate=0.001, seed: 3, tcp/10.0.0.1:7447",
+            "training.learning_rate=0.001, seed: 3, tcp/10.0.0.1:7447",
+        ),
+        ("TOKENIZERS_PARALLELISM is false", "TOKENIZERS_PARALLELISM is false"),
+        ("ask ada@example.org, see https://example.org/a@b", "ask ada@example.org, see https://example.org/a@b"),
+    ],
+)
+def test_passwords_and_tokens_are_hidden(text: str, shown: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_API_KEY", "in-the-environment")
+    monkeypatch.setenv("TOKENIZERS_PARALLELISM", "false")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "postgresql://u:p%40ss%2Fword1@db")
+    assert without_secrets(text) == shown
+    assert without_secrets(shown) == shown
+    assert bounded_text(text) == shown

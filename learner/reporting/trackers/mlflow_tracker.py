@@ -10,6 +10,7 @@ from typing import Any
 
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.trackers.tracker import PROJECT, SUMMARY, TrackedRun, flat, tagged
+from daedalus.protocol.redaction import without_secrets
 
 # MLflow's own defaults make a call to a server that does not answer last for many minutes.
 _HTTP = {"MLFLOW_HTTP_REQUEST_TIMEOUT": "20", "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1"}
@@ -51,7 +52,7 @@ class MlflowTracker:
             self._client.update_run(self.id, status="RUNNING")
             changed = {name: value for name, value in settings.items() if known.data.params.get(name) != value}
             self._client.log_batch(self.id, tags=[RunTag(f"resumed.{name}", value) for name, value in changed.items()])
-        address = re.sub(r"//[^/@]*@", "//", self._client.tracking_uri)  # without a password
+        address = without_secrets(self._client.tracking_uri)
         self.place = f"run {run.name} ({self.id}) at {address}"
 
     def _known(self, id: str) -> Any:
