@@ -51,7 +51,7 @@ class ObservationComponent(NamedTuple):
         """Return this component of batched observations: [E, *shape], uint8 or float32, discrete ones counted from 0.
 
         Raises EnvironmentSetupError for values of another shape than the space has, or that its dtype would change,
-        and for a discrete value outside the space: it could not be encoded.
+        and for a discrete or binary value outside the space, as batch_of_one does for those of other loops.
         """
         values = self.leaf.of(observations)
         space = self.leaf.space
@@ -59,13 +59,11 @@ class ObservationComponent(NamedTuple):
             values = self._fitted(values)
         values = values.reshape(len(values), *self.shape)
         if self.first is not None:
-            values = values - self.first
-            if ((values < 0) | (values >= self.counts)).any():
-                raise EnvironmentSetupError(
-                    f"the environment returned an observation outside its space{self._where}: "
-                    f"{described(values + self.first)} for {described(self.leaf.space)}"
-                )
-            return values
+            if ((values < self.first) | (values >= self.first + self.counts)).any():
+                raise self._outside(values)
+            return values - self.first
+        if isinstance(space, gym.MultiBinary) and ((values < 0) | (values > 1)).any():
+            raise self._outside(values)
         if values.dtype in (np.uint8, np.float32):
             return values
         with np.errstate(all="ignore"):  # the learner, or the evaluation, names a value that is not finite
@@ -74,6 +72,12 @@ class ObservationComponent(NamedTuple):
     @property
     def _where(self) -> str:
         return f" in component {self.leaf.name!r}" if self.leaf.path else ""
+
+    def _outside(self, values: np.ndarray) -> EnvironmentSetupError:
+        return EnvironmentSetupError(
+            f"the environment returned an observation outside its space{self._where}: "
+            f"{described(values)} for {described(self.leaf.space)}"
+        )
 
     def _fitted(self, values: np.ndarray) -> np.ndarray:
         """Return a batch, of a vector environment that did not make it by its spaces, in the dtype of the space."""

@@ -1,9 +1,11 @@
 """The error message for invalid settings, in one line. Pure functions."""
 
 import difflib
+from collections.abc import Iterable
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
@@ -40,6 +42,29 @@ def one_line(error: ValidationError) -> str:
         return f"setting {name} is {value!r}, which is not valid{hint}"
     bounds = _bounds(path)
     return f"setting {name} {message}, not {value!r}{f' (it must be {bounds})' if bounds else ''}"
+
+
+def ambiguous(path: list[str], value: Any) -> str:
+    """Return what pydantic would convert without a word in the value of a setting, or an empty string.
+
+    It takes true for the number 1, and a set, which has no order, for a list.
+    """
+    kinds = _types(path)
+    if isinstance(value, set | frozenset):
+        return f"{value!r}, which has no order: write a list"
+    if isinstance(value, list | tuple):
+        return next((found for part in value if (found := ambiguous(path, part))), "")
+    if isinstance(value, dict) and any(get_origin(kind) is dict for kind in kinds):
+        return next((found for part in value.values() if (found := ambiguous(path, part))), "")
+    if not isinstance(value, bool | np.bool_) or bool in kinds or {int, float}.isdisjoint(_numbers(kinds)):
+        return ""
+    return f"{str(value).lower()}, which is no number: write a number"
+
+
+def _numbers(kinds: Iterable[Any]) -> set[Any]:
+    """Return the types of the values in values of these types: of a list, those of its elements."""
+    inner = [_bare(part) for kind in kinds for part in get_args(kind) if part is not ...]
+    return {*kinds, *(_numbers(inner) if inner else ())}
 
 
 def _path(location: tuple[int | str, ...]) -> list[str]:

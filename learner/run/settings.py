@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import JsonValue, ValidationError
 
 from daedalus.learner.run.run_files import RunDataError, read_toml
-from daedalus.learner.run.setting_errors import known_names, one_line, unknown_setting
+from daedalus.learner.run.setting_errors import ambiguous, known_names, one_line, unknown_setting
 from daedalus.protocol.algorithms import check_algorithm
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 
@@ -228,6 +228,10 @@ def _assign(section: dict[str, Any], key: str, value: Any) -> None:
 def run_spec(settings: dict[str, Any]) -> RunSpec:
     """Return the validated specification. Raises SettingsError, which names the first invalid setting."""
     plain = dict(settings)
+    for section, values in plain.items():
+        for key, value in values.items() if isinstance(values, dict) else ():
+            if (section, key) not in _TABLES and (doubt := ambiguous([section, key], value)):
+                raise SettingsError(f"setting {section}.{key} is {doubt}")
     for section, name in sorted(_TABLES):
         values = plain.get(section)
         if isinstance(values, dict) and isinstance(values.get(name), dict):

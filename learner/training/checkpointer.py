@@ -180,7 +180,7 @@ class Checkpointer:
             return None
         if time.monotonic() < self._state.evaluations.heard + silence:
             return None
-        return TrainingScore(return_mean=mean, episodes=episodes, shaped=bool(self._spec.environment.training_kwargs))
+        return TrainingScore(return_mean=mean, episodes=episodes, true_task=self._spec.environment.trains_true_task)
 
     # ------------------------------------------------------------------------------- on the thread that writes
 

@@ -2,7 +2,7 @@
 
 There are two kinds of scores, and they are never compared with each other. One is the mean return of an evaluation: of
 episodes that this policy alone played. Where nobody evaluates, it is that of the newest episodes of training, which
-slightly older policies played, perhaps with exploration and other rewards.
+slightly older policies played, perhaps with exploration and in another task.
 """
 
 import math
@@ -23,13 +23,15 @@ class TrainingScore:
 
     return_mean: float
     episodes: int
-    shaped: bool = False  # whether environment.training_kwargs changes the environment, and perhaps its rewards
+    true_task: bool = True  # whether training plays the task of evaluations (EnvironmentSpec.trains_true_task)
 
     @property
     def of(self) -> str:
         """What the score is of."""
-        rewards = ", with the rewards of environment.training_kwargs" if self.shaped else ""
-        return f"the newest {self.episodes} training episodes{rewards}"
+        other = (
+            "" if self.true_task else ", of another task (environment.training_kwargs or environment.no_reward_limit)"
+        )
+        return f"the newest {self.episodes} training episodes{other}"
 
     def described(self) -> dict[str, Any]:
         """Return the score as JSON values, with what it is of."""

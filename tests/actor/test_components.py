@@ -295,6 +295,16 @@ def test_discrete_observation_outside_its_space_is_refused() -> None:
         component.values(np.array([0, 3]))
 
 
+def test_binary_observation_that_is_neither_0_nor_1_is_refused_as_from_a_client() -> None:
+    (component,) = observation_components(gym.MultiBinary(2))
+    assert component.values(np.array([[0, 1]], np.int8)).tolist() == [[0.0, 1.0]]
+    for other in (2, -1):
+        with pytest.raises(EnvironmentSetupError, match=r"an observation outside its space: .* for MultiBinary\(2\)"):
+            component.values(np.array([[0, other]], np.int8))
+        with pytest.raises(ValueError, match="which is outside MultiBinary"):
+            batch_of_one(gym.MultiBinary(2), np.array([0, other], np.int8))
+
+
 @pytest.mark.parametrize(
     ("observation", "action", "reason"),
     [

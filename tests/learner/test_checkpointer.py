@@ -258,13 +258,17 @@ def test_the_good_weights_of_a_run_that_collapses_without_evaluator_are_kept(run
     assert find_policy(run.directory).policy_version == 12
 
 
-def test_shaped_training_returns_are_called_so(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("settings", "other"),
+    [({"training_kwargs": {"bonus": 1.0}}, True), ({"no_reward_limit": 9}, True), ({"training_kwargs": {}}, False)],
+)
+def test_training_returns_of_another_task_are_called_so(tmp_path: Path, settings: dict, other: bool) -> None:
     spec = run_spec()
-    shaped = spec.environment.model_copy(update={"training_kwargs": {"bonus": 1.0}})
-    run = Run(tmp_path, spec.model_copy(update={"environment": shaped}))
+    run = Run(tmp_path, spec.model_copy(update={"environment": spec.environment.model_copy(update=settings)}))
     collapse(run, 5.0)
     score = SealedDirectory(checkpoints(tmp_path)[0]).content["score"]
-    assert score["of"] == "the newest 100 training episodes, with the rewards of environment.training_kwargs"
+    task = ", of another task (environment.training_kwargs or environment.no_reward_limit)" if other else ""
+    assert score["of"] == f"the newest 100 training episodes{task}"
 
 
 def test_training_returns_of_too_few_episodes_or_of_an_evaluated_run_are_no_scores(run: Run) -> None:

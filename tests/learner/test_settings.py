@@ -132,6 +132,25 @@ def test_value_is_parsed_as_toml_or_else_used_as_text(assignment: str, value: ob
     assert settings(assignment)["training"] == {"x": value}
 
 
+@pytest.mark.parametrize(
+    ("path", "value", "reason"),
+    [
+        ("training.learning_rate", True, "true, which is no number"),
+        ("environment.frame_stack", np.True_, "true, which is no number"),
+        ("environment.frame_stack", {"a": True}, "true, which is no number"),
+        ("policy.hidden", [64, True], "true, which is no number"),
+        ("environment.action_table", [[1.0], [False]], "false, which is no number"),
+        ("policy.hidden", {64, 32}, "which has no order: write a list"),
+        ("environment.action_table", [{1.0, 0.0}, [0.0, 1.0]], "which has no order: write a list"),
+    ],
+)
+def test_value_that_pydantic_would_convert_to_another_is_refused(path: str, value: object, reason: str) -> None:
+    chosen = settings()
+    assign(chosen, path, value)
+    with pytest.raises(SettingsError, match=rf"^setting {path} is .*{reason}"):
+        run_spec(chosen)
+
+
 def test_value_none_unsets_a_setting() -> None:
     assert settings("training.x=none", training={"x": 1, "y": 2})["training"] == {"y": 2}
     assert run_spec(settings("training.target_return=none", training={"target_return": 4.0})).training == (
