@@ -103,7 +103,9 @@ class _Stop(threading.Event):
         return found
 
 
-def stop_on_signals(*, exit_if_stuck: bool = False, stuck_seconds: float = _STUCK_SECONDS) -> threading.Event:
+def stop_on_signals(
+    *, exit_if_stuck: bool = False, stuck_seconds: float = _STUCK_SECONDS, end_seconds: float = _END_SECONDS
+) -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
     The process can so close its resources before it ends. A thread sets the event, not the signal handlers. Python
@@ -112,7 +114,7 @@ def stop_on_signals(*, exit_if_stuck: bool = False, stuck_seconds: float = _STUC
 
     With `exit_if_stuck`, the process ends with status 1 if the main thread does not check the event within
     `stuck_seconds`, because a call such as a step of a simulator does not return, or does not end within
-    `_END_SECONDS` more.
+    `end_seconds` more.
     """
     stop = _Stop()
 
@@ -133,7 +135,9 @@ def stop_on_signals(*, exit_if_stuck: bool = False, stuck_seconds: float = _STUC
         os.register_at_fork(after_in_child=_default_signals)
     threading.Thread(target=watch, name="signals", daemon=True).start()
     if exit_if_stuck:
-        threading.Thread(target=_exit_if_stuck, args=(stop, stuck_seconds), name="stuck-watch", daemon=True).start()
+        threading.Thread(
+            target=_exit_if_stuck, args=(stop, stuck_seconds, end_seconds), name="stuck-watch", daemon=True
+        ).start()
     return stop
 
 
@@ -148,11 +152,11 @@ def _ignore(_number: int, _frame: object) -> None:
     """Handle a signal that a thread reads from the wakeup descriptor."""
 
 
-def _exit_if_stuck(stop: _Stop, stuck_seconds: float) -> None:
+def _exit_if_stuck(stop: _Stop, stuck_seconds: float, end_seconds: float) -> None:
     """Wait for `stop`, and end the process unless it ends by itself."""
     stop.wait()
     if stop.noticed.wait(stuck_seconds):
-        time.sleep(_END_SECONDS)
+        time.sleep(end_seconds)
     _end_with(_say_stuck, within=_LAST_WORD_SECONDS)
 
 

@@ -52,6 +52,7 @@ from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.descriptors import reserve_descriptors
 from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.initial import allows_other_spaces, initial_to_resume
@@ -103,6 +104,7 @@ def main() -> int:
     here = surroundings.directory
     keep_freed_memory()
     raise_descriptor_limit()
+    reserve_descriptors()
     # An update may take long. A disk that does not answer may hold this thread for ever.
     stop = stop_on_signals(exit_if_stuck=True, stuck_seconds=_UPDATE_SECONDS)
     user_metrics = UserMetrics()

@@ -97,6 +97,9 @@ examples:
 exit status: as of daedalus train"""
 
 
+# After a signal: for a call that uses the disk, and then for the end of the child processes, of which the learner takes
+# the longest
+_DISK_SECONDS, _END_SECONDS = 10.0, 90.0
 _MISSED = 3  # exit status: the budget was used up before the target
 
 
@@ -290,7 +293,8 @@ def _run(
         observer=TrainingDisplay(screen, run_directory.run_name(directory)) if live else RunObserver(),
     )
     output = ChildOutput(directory / run_directory.OUTPUT, screen.out, screen.err)
-    stopping = stop_on_signals()
+    # A disk that does not answer may hold this thread. The child processes then end with this one, by themselves.
+    stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=_DISK_SECONDS, end_seconds=_END_SECONDS)
     if parsed.exit_with_parent:
         exit_with_parent(stopping)
     try:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 from daedalus.learner.reporting.metrics import Details, MetricsWriter
 from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.run.descriptors import reserved_descriptors
 
 _QUEUED_ROWS = 256  # further rows are dropped
 _RETRY_SECONDS = 10.0  # after a writer failed
@@ -74,9 +75,10 @@ class Recorder:
         while (taken := self._rows.get()) is not None:
             self._progress.show(taken[0])
             self.busy_since = time.monotonic()
-            if self._failed_at is None or time.monotonic() >= self._failed_at + _RETRY_SECONDS:
-                self._write(*taken)
-            self._write_events()
+            with reserved_descriptors():
+                if self._failed_at is None or time.monotonic() >= self._failed_at + _RETRY_SECONDS:
+                    self._write(*taken)
+                self._write_events()
             self.busy_since = None
         self._close_writers()
 

@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+from daedalus.learner.run.descriptors import reserved_descriptors
 from daedalus.policy.saving.regular_files import open_own, read_regular
 
 HEARTBEAT = "heartbeat"
@@ -62,7 +63,7 @@ class Heartbeat:
             self._write(self._newest)
 
     def _write(self, now: float) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), reserved_descriptors():
             file = open_own(self._path, os.O_WRONLY | os.O_CREAT, 0o644)  # not cut: a full disk has no room for more
             try:
                 os.pwrite(file, f"{now:017.3f} {_boot()}\n".encode(), 0)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from daedalus.learner.run.descriptors import reserved_descriptors
 from daedalus.learner.run.evaluations import Evaluated
 from daedalus.learner.run.health import SLOW_DISK_SECONDS
 from daedalus.learner.run.run_directory import CONFIG, write_config
@@ -193,7 +194,8 @@ class Checkpointer:
         while True:
             job = self._jobs.get()
             self._health.saving_since = time.monotonic()
-            job()
+            with reserved_descriptors():
+                job()
             self._health.saving_since = None
             with self._counting:
                 self._unfinished -= 1

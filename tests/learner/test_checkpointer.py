@@ -1,9 +1,11 @@
 """learner/training/checkpointer.py: checkpoints are written beside training, and the best of them are kept."""
 
 import os
+import resource
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,9 @@ from log_lines import LINES
 from daedalus.learner.run import health, run_directory
 from daedalus.learner.run.candidates import candidates
 from daedalus.learner.run.counters import check_counters
+from daedalus.learner.run.descriptors import reserve_descriptors
 from daedalus.learner.run.evaluations import Evaluated
+from daedalus.learner.run.heartbeat import HEARTBEAT, Heartbeat
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training import checkpointer as module
@@ -291,3 +295,36 @@ def test_a_learner_that_resumes_is_newer_than_every_learner_before_its_checkpoin
     after = RunState(tmp_path, run_spec(), 0.0, starts_before=check_counters(copies[0].saved(now=1.0))["starts"])
     assert after.learner_epoch > max(copy.learner_epoch for copy in copies)
     assert new_epoch(10**9) < 2**62
+
+
+@pytest.fixture
+def every_descriptor() -> Iterator[Callable[[], None]]:
+    """Return a function that opens files until this process may open no more."""
+    before, files = resource.getrlimit(resource.RLIMIT_NOFILE), []
+
+    def take() -> None:
+        with suppress(OSError):
+            while True:
+                files.append(os.open(os.devnull, os.O_RDONLY))
+
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))) + 256, before[1]))
+    reserve_descriptors()
+    yield take
+    for file in files:
+        os.close(file)
+    resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    reserve_descriptors(0)
+
+
+def test_checkpoint_is_saved_while_connections_hold_every_other_descriptor(
+    tmp_path: Path, every_descriptor: Callable[[], None]
+) -> None:
+    run = Run(tmp_path)
+    every_descriptor()
+    assert run.save().is_saved
+    with pytest.raises(OSError, match="Too many open files"):
+        os.open(os.devnull, os.O_RDONLY)  # which the next connection would get
+    run.train()
+    assert run.finish_last()
+    Heartbeat(tmp_path).beat()
+    assert (tmp_path / HEARTBEAT).exists()
