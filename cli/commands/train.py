@@ -66,8 +66,8 @@ _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows their progress. When the training episodes reach the
 target, the policy of that moment plays 100 new sampled episodes (training.target_episodes). Training stops if they
 confirm the target, or when the budget is used up. Then the best policy plays 100 episodes (evaluation.final_episodes).
-If the run was evaluated on a schedule (evaluation.seconds), the three best checkpoints and the newest first play as
-many new episodes each to select the best. Otherwise the newest policy is used."""
+The best checkpoints, by evaluations on a schedule (evaluation.seconds) or by training episodes, and the newest first
+play as many new episodes each to select it, unless nobody evaluated and the newest was the best in training."""
 
 _TRAIN_EXAMPLES = """\
 examples:
