@@ -63,7 +63,7 @@ ALGORITHMS = {
     "a3c": AlgorithmRecord(
         summary="asynchronous, uncorrected; the paper's with --set collection.upload=gradients",
         batch_rollouts=1,
-        max_lag_batches=8,  # measured: docs/results.md
+        max_lag_batches=8,  # measured: docs/study.md
     ),
     "impala": AlgorithmRecord(summary="asynchronous, corrected for policy lag", corrected=True),
     "appo": AlgorithmRecord(summary="asynchronous PPO: several passes over each batch", passes_over_batch=True),

@@ -43,7 +43,7 @@ class LateRenderedCarRacing(car_racing.CarRacing):
             gymnasium's.
           lost_share: a car that has had no wheel on the road for 1.2 s is lost. Its episode terminates, and takes back
             this share of its return so far. A fixed loss that matters to a good policy delays the learning of one that
-            has just begun (docs/results.md, "Cars off the road"). None: as gymnasium's.
+            has just begun (docs/results.md, "What was tried"). None: as gymnasium's.
           kwargs: of gymnasium's environment.
         """
         self._missed_tile_reward, self._lost_share = missed_tile_reward, lost_share

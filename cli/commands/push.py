@@ -12,7 +12,7 @@ from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
 
 _DESCRIPTION = """\
-Uploads the best policy of a run (or the newest, if none was evaluated) to the Hugging Face Hub: the program (ONNX), the
+Uploads the policy of a run that `daedalus evaluate` uses, the best, to the Hugging Face Hub: the program (ONNX), the
 weights (safetensors), the settings, the metrics, the recorded evaluation, the newest video of the run directory, and a
 model card with the results. Nothing in the upload can execute. Names of actors and hosts are not part of it."""
 

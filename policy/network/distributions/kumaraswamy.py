@@ -26,7 +26,7 @@ class Kumaraswamy(Distribution):
 
     a and b are 1 + softplus of the head's outputs: above 1 the density has one peak and no pole. The greedy action is
     the mean. The median is a worse choice where the density is skewed: a car that was trained with samples drove far
-    worse with it (docs/results.md, "CarRacing-v3 from pixels").
+    worse with it (docs/results.md, "What was tried").
     """
 
     def __init__(self, space: ContinuousSpace) -> None:
