@@ -74,7 +74,7 @@ def make_rollout(
         "truncated": truncated,
         "valid": valid,
         "episode_returns": np.full(ends, -1.5, np.float32),
-        "episode_lengths": np.full(ends, 4, np.int32),
+        "episode_lengths": np.full(ends, 1, np.int32),
     }
     if isinstance(replaced.get("frames"), np.ndarray):
         replaced["frames"] = {"observation": replaced["frames"]}
@@ -95,7 +95,7 @@ def join(rollouts: Sequence[Rollout], spaces: Spaces = SPACES) -> Batch:
 
 def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces = SPACES, seed: int = 1) -> Fleet:
     """Return a fleet in which incarnation 1 of each named actor has joined and is present."""
-    fleet = Fleet(seed, None)
+    fleet = Fleet(seed, None, expected_environments=environments)
     for actor in actors:
         assert fleet.join(Join(actor=actor, incarnation=1, spaces=spaces, environments=environments), 0.0) is None
         fleet.set_present(actor, 1, True, 0.0)

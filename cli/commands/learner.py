@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 from daedalus.algorithms.errors import AlgorithmError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.evaluation_processes import EvaluationFailedError
 from daedalus.cli.learner_network import announce, learner_credentials, open_transport
 from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.own_algorithm import with_record
@@ -41,6 +42,7 @@ from daedalus.cli.processes import (
 )
 from daedalus.cli.quick_check import expected_defaults, expected_spaces
 from daedalus.cli.ranks import RankProcesses, StartedRanks, follow_launched, meeting_for, ranks_for
+from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
 from daedalus.cli.supervised_learner import supervise_learner
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
@@ -65,7 +67,7 @@ from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_words, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.credentials import Credentials, CredentialsError
@@ -80,6 +82,8 @@ _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it r
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
+_POLL_SECONDS = 0.05  # until a target that was reached is noticed
+_END_SECONDS = 4.0  # for the process that plays to end
 _UPDATE_SECONDS = 120.0  # longer than one takes
 
 REACHED, NOT_REACHED = 0, 3
@@ -215,7 +219,12 @@ class _Command:
             self.context["epoch"] = f"{service.learner_epoch:x}"
             announce(run, arguments, self.credentials)
             if arguments.prepared is None:  # else the launcher starts them
-                _start_trackers(run.directory, arguments, self.progress, self.stop, stack)
+                output = stack.enter_context(
+                    ChildOutput(run.directory / run_directory.OUTPUT, self.progress.say, self.progress.say)
+                )
+                _start_trackers(run.directory, arguments, output, self.stop, stack)
+                if _confirms(run.spec):
+                    _start_confirmations(run, arguments, output, self.stop, stack)
             outcome = service.run()
             if outcome.superseded_by is not None:
                 _note_superseded(run.directory, outcome.superseded_by)
@@ -261,7 +270,7 @@ class _Command:
             certificate_days_left=partial(certificate_days_left, self.credentials),
             user_metrics=self.user_metrics,
             open_ranks=self.ranks.open,
-            confirms=self.arguments.confirm,
+            confirms=self.arguments.confirm or (self.arguments.prepared is None and _confirms(run.spec)),
             reset_statistics=self.arguments.reset_statistics,
         )
 
@@ -290,15 +299,47 @@ def _writers(directory: Path, rows_to: int | None) -> list[OpenWriter]:
 
 
 def _start_trackers(
-    directory: Path, arguments: argparse.Namespace, progress: Progress, stop: threading.Event, stack: ExitStack
+    directory: Path, arguments: argparse.Namespace, output: ChildOutput, stop: threading.Event, stack: ExitStack
 ) -> None:
     """Start the chosen trackers and those that have logged the run before; `stack` ends them."""
     names = chosen_trackers(arguments.log, directory)
     if names:
-        output = stack.enter_context(ChildOutput(directory / run_directory.OUTPUT, progress.say, progress.say))
         trackers = TrackerProcesses(names, directory, output, service=True, log_json=arguments.log_json)
         stack.callback(trackers.finish, stop)
         trackers.start()
+
+
+def _confirms(spec: RunSpec) -> bool:
+    return spec.training.target_return is not None and spec.training.stop_when_solved
+
+
+def _start_confirmations(
+    run: ChosenRun, arguments: argparse.Namespace, output: ChildOutput, stop: threading.Event, stack: ExitStack
+) -> None:
+    """Play new episodes here when the target is reached, as `daedalus train` does; `stack` ends them.
+
+    Only what actors report says that it is reached. Where the environment cannot be made, that counts.
+    """
+    allowed = allow_words(
+        module for module in modules_of(run.spec.environment.user_modules) if module in run.modules.allowed
+    )
+    options = ["--log-level", arguments.log_level, *(["--log-json"] if arguments.log_json else []), *allowed]
+    confirmations, ended = Confirmations(run.directory, run.spec, options, output), threading.Event()
+
+    def play() -> None:
+        try:
+            while not ended.wait(_POLL_SECONDS):
+                confirmations.poll()
+        except EvaluationFailedError as error:  # the learner waits for a result that it cannot get
+            _logger.error("%s", error)
+            stop.set()
+        finally:
+            confirmations.close()
+
+    thread = threading.Thread(target=play, name="confirmations", daemon=True)
+    thread.start()
+    stack.callback(thread.join, _END_SECONDS)
+    stack.callback(ended.set)
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":

@@ -85,7 +85,7 @@ class ActorServer:
           orders: receives the orders of operators, and notes a newer learner; None: nobody carries them out.
         """
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
-        self.fleet = Fleet(spec.training.seed, spaces, spec.training.epsilons)
+        self.fleet = Fleet(spec.training.seed, spaces, spec.training.epsilons, spec.collection.envs_per_actor)
         self._run, self._transport, self._epoch = run, transport, learner_epoch
         self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
         self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before

@@ -36,9 +36,13 @@ class Actor:
     incarnations: int = 0  # number of incarnations that joined
     origin: Origin = UNKNOWN  # of the newest incarnation
     environments: int = 0  # 0 before the actor has joined with its spaces
+    joined: float = 0.0  # when the newest incarnation joined
     last_seen: float = 0.0
     left: bool = False  # whether the newest incarnation was present and is no longer
     sequences: SequenceWindow = field(default_factory=SequenceWindow)  # of the newest incarnation
+    uploads: int = 0  # rollouts or gradients of the newest incarnation that were received, whatever their verdict
+    rows: int = 0  # env_steps that its accepted ones state
+    episode_rows: int = 0  # env_steps of the episodes that they report
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     busy: int = 0  # number of `busy` answers
@@ -100,6 +104,7 @@ class Actor:
         self.missed_earlier = self.missed
         self.incarnation, self.sequences = incarnation, SequenceWindow(low=next_sequence)
         self.incarnations += 1
+        self.uploads, self.rows, self.episode_rows = next_sequence, 0, 0
         self.consecutive_unfit = self.faults = self.good_in_a_row = 0
         self.left = False
         self.quarantined, self.drained = "", False

@@ -27,6 +27,8 @@ from daedalus.protocol.uploads import RolloutIdentity
 __all__ = ["Actor", "Fleet"]
 
 _MAX_ACTORS = 16_384
+# Environments that an actor may state: the larger of a number and a multiple of what the run expects.
+_FEW_ENVIRONMENTS, _TIMES_EXPECTED = 256, 8
 _MAX_OF_ONE_OWNER = 4096  # so that one certificate cannot fill the fleet
 _FORGET_SECONDS = 60.0  # of absence
 _EPSILON = 1  # distinguishes this draw from others by the same seed and name
@@ -41,15 +43,19 @@ def _number(name: str) -> int:
 class Fleet:
     """All actors of a run, and the spaces that they share."""
 
-    def __init__(self, seed: int, spaces: Spaces | None, epsilons: Sequence[float] = (0.0,)) -> None:
+    def __init__(
+        self, seed: int, spaces: Spaces | None, epsilons: Sequence[float] = (0.0,), expected_environments: int = 1
+    ) -> None:
         """Construct an empty fleet.
 
         Args:
           seed: of the run.
           spaces: of the environment, if they are known before the first actor.
           epsilons: those that actors draw theirs from.
+          expected_environments: of each actor, by the settings of the run.
         """
         self._seed, self._epsilons = seed, epsilons
+        self._most_environments = min(max(_FEW_ENVIRONMENTS, _TIMES_EXPECTED * expected_environments), MAX_ENVIRONMENTS)
         self.spaces = spaces  # known before, or from the first actor
         self.actors: dict[str, Actor] = {}  # joined actors, by name
         self.pushed_bytes = 0  # snapshots published so far, as sent to each subscriber
@@ -79,8 +85,10 @@ class Fleet:
         refusal = self._check_identity(join)
         if refusal is not None or join.spaces is None:
             return refusal
-        if not 1 <= join.environments <= MAX_ENVIRONMENTS:
-            reason = f"environments is {join.environments}: it must be from 1 to {MAX_ENVIRONMENTS}"
+        if not 1 <= join.environments <= self._most_environments:
+            reason = f"environments is {join.environments}: in this run it must be from 1 to {self._most_environments}"
+            if 1 <= join.environments <= MAX_ENVIRONMENTS:
+                reason += f", the larger of {_FEW_ENVIRONMENTS} and {_TIMES_EXPECTED} x collection.envs_per_actor"
             return Refusal(code="malformed", reason=reason)
         if self.spaces is not None and join.spaces != self.spaces:
             return Refusal(
@@ -101,6 +109,7 @@ class Fleet:
         actor.last_seen = now
         if actor.incarnation != join.incarnation:
             self._replace_incarnation(actor, join.incarnation)
+            actor.joined = now
         actor.environments, actor.origin = join.environments, bounded(join.origin)
         self.changed()
         return None

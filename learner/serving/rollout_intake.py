@@ -253,7 +253,9 @@ class RolloutIntake:
             arrived, request = taken
             sender, payload = keys.last_chunk(request.key), request.payload
             content = self._judge.read(sender, payload)
-            if not self._wait_for_room(content, arrived + LATE_SECONDS):
+            with self._lock:
+                too_fast = self._judge.is_too_fast(content, time.monotonic())
+            if too_fast or not self._wait_for_room(content, arrived + LATE_SECONDS):
                 self._answer_busy(request)
                 continue
             with self._lock:

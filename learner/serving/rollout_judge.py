@@ -24,6 +24,10 @@ from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER, MAX_INFO_NAMES, Gr
 # Per environment and row, besides observations, actions and masks, rounded up; integers may be sent in 8 bytes each.
 _ROW_BYTES, _INTEGER_BYTES = 24, 8
 _SLACK_BYTES = 64 << 10
+_MOST_GRADIENT_ROWS = 250_000.0  # a second, of which one actor's thread computes gradients: none comes near it
+_CLIENT_ROWS = 10_000.0  # a second, that an environment of a client plays: none comes near it
+_BEGIN_SECONDS = 10.0  # that an actor may have played before it joined
+_LOST = 4  # rollouts that were sent, at most, for each that has arrived
 _MAX_REASON = 500  # bytes, in the answer to a rollout
 _OTHER_ARRAYS = 17  # besides observations, actions, masks and scalars of info
 # Largest decoded rollout, whichever is larger: bytes, or rollouts with the run's own number of environments. An actor
@@ -137,7 +141,7 @@ class RolloutJudge:
           policy_version: newest policy version; the policy lag is relative to it.
           now: time on the monotonic clock, in seconds.
         """
-        verdict = content if isinstance(content, Rejected) else self._judge(sender, content, policy_version)
+        verdict = content if isinstance(content, Rejected) else self._judge(sender, content, policy_version, now)
         actor = self._fleet.actors.get(sender)
         if actor is not None:
             actor.last_seen = now
@@ -145,6 +149,8 @@ class RolloutJudge:
                 actor.rejected[verdict.cause] += 1
             else:
                 actor.accepted += 1
+                actor.rows += verdict.env_steps
+                actor.episode_rows += int(verdict.episode_lengths.sum(dtype=np.int64))
                 actor.consecutive_unfit = 0
                 actor.policy_lag = policy_version - verdict.policy_version
             if isinstance(verdict, Rejected) and verdict.cause == "unfit":
@@ -154,7 +160,20 @@ class RolloutJudge:
                     verdict = Rejected(verdict="quarantined", cause="unfit", reason=actor.quarantined)
         return verdict
 
-    def _judge(self, sender: str, rollout: Upload, policy_version: int) -> Upload | Rejected:
+    def is_too_fast(self, upload: Upload | Rejected, now: float) -> bool:
+        """Return whether an actor states more env_steps than it can have computed gradients of since it joined.
+
+        A few bytes can state very many. With rollouts the learner itself has to compute, and nobody outruns it.
+        """
+        if not isinstance(upload, Gradient):
+            return False
+        actor = self._fleet.find(upload.identity)
+        if actor is None:
+            return False
+        most = _MOST_GRADIENT_ROWS * (now - actor.joined + 1.0)
+        return actor.rows + upload.env_steps > most
+
+    def _judge(self, sender: str, rollout: Upload, policy_version: int, now: float) -> Upload | Rejected:
         wrong_identity = self._check_identity(sender, rollout)
         if wrong_identity is not None:
             return wrong_identity
@@ -165,12 +184,43 @@ class RolloutJudge:
         if lag < 0:
             reason = f"policy version {rollout.policy_version} is newer than the learner's version {policy_version}"
             return Rejected(verdict="rejected", cause="unfit", reason=reason)
+        violation = self._impossible_episodes(rollout, actor, now)
+        if violation:
+            return Rejected(verdict="rejected", cause="unfit", reason=violation)
         actor.sequences.add(identity.sequence)
+        actor.uploads += 1
         # A synchronous algorithm accepts only rollouts of the newest version.
         most = 0 if self._spec.algorithm.synchronous else self._spec.policy_lag_bound_with(len(self._fleet.live))
         if lag > most:
             return Rejected(verdict="rejected", cause="stale", reason=f"policy lag {lag}, at most {most} is allowed")
         return rollout
+
+    def _impossible_episodes(self, upload: Upload, actor: Actor, now: float) -> str:
+        """Return why the actor cannot have played the episodes that it reports, or an empty string.
+
+        They cannot be longer than the rows that it has played. Those are the ones that it has sent: environments begin
+        anew when an actor joins. Some may be lost on the way, which sequence numbers show, but they are not believed
+        alone. A client plays rows that it never sends, such as while it waits, or while a person steers: it has one
+        environment in a rollout, unless its agents act in step, and lives in real time.
+        """
+        lengths = upload.episode_lengths
+        if not len(lengths):
+            return ""
+        rows = self._spec.collection.rollout_length * min(upload.identity.sequence + 1, _LOST * (actor.uploads + 1))
+        if actor.environments == 1 or self._spec.algorithm.synchronous:
+            rows += int(_CLIENT_ROWS * (now - actor.joined + _BEGIN_SECONDS))
+        longest, total = int(lengths.max()), sum(lengths.tolist())
+        if longest > rows or actor.episode_rows + total > rows * actor.environments:
+            return (
+                f"it reports episodes of {total} env_steps, the longest of {longest}, and {actor.episode_rows} before, "
+                f"but the actor has played at most {rows} rows in each of its {actor.environments} environments"
+            )
+        environment = self._spec.environment
+        if environment.reward_clip is None and environment.reward_scale:
+            most = lengths * (1.001 * LARGEST_REWARD / abs(environment.reward_scale))
+            if (np.abs(upload.episode_returns) > most).any():
+                return f"episode_returns has a value that rewards within +-{LARGEST_REWARD:g} do not add up to"
+        return ""
 
     def _check_identity(self, sender: str, rollout: Upload) -> Rejected | None:
         """Return a rejection if a rollout is for another learner epoch or from another incarnation, else None."""

@@ -68,6 +68,15 @@ def test_join_with_number_of_environments_out_of_range_is_refused() -> None:
         assert (fleet.spaces, fleet.actors) == (None, {})
 
 
+@pytest.mark.parametrize(("expected", "most"), [(8, 256), (100, 800), (1000, 4096)])
+def test_an_actor_states_at_most_a_multiple_of_the_environments_that_the_run_expects(expected: int, most: int) -> None:
+    fleet = Fleet(1, None, expected_environments=expected)
+    refusal = fleet.join(Join(actor="b", incarnation=1, spaces=SPACES, environments=most + 1), 0.0)
+    assert refusal is not None
+    assert f"must be from 1 to {most}" in refusal.reason
+    assert fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=most), 0.0) is None
+
+
 def test_new_incarnation_replaces_an_absent_one_and_starts_without_sequence_numbers() -> None:
     fleet = joined_fleet("a")
     actor = fleet.actors["a"]

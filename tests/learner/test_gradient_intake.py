@@ -182,6 +182,21 @@ def test_the_promises_about_rollouts_hold_for_gradients(
     assert reason in verdict.reason
 
 
+def test_the_episodes_of_gradients_are_no_longer_than_the_rows_that_the_actor_has_sent(harness: Harness) -> None:
+    verdict = harness.receive(replace(GOOD, episode_lengths=np.full_like(GOOD.episode_lengths, 500)))
+    assert isinstance(verdict, Rejected)
+    assert f"has played at most {ROWS} rows in each" in verdict.reason
+
+
+def test_the_env_steps_of_gradients_are_bounded_by_time(harness: Harness) -> None:
+    """305 messages of zeros once used up a budget of 20M env_steps within 3 s; the intake answers busy instead."""
+    assert not harness.judge.is_too_fast(GOOD, 0.0)
+    harness.fleet.actors["a"].rows = 1_000_000
+    assert harness.judge.is_too_fast(GOOD, 3.0)
+    assert not harness.judge.is_too_fast(GOOD, 3.1)
+    assert not harness.judge.is_too_fast(replace(GOOD, identity=identity("b")), 3.0)
+
+
 def test_a_run_of_rollouts_rejects_gradients() -> None:
     fleet = joined_fleet("a")
     judge = RolloutJudge(run_spec(), EPOCH, fleet)

@@ -44,7 +44,9 @@ def transport() -> MemoryTransport:
 
 @pytest.fixture
 def server(transport: MemoryTransport) -> Iterator[ActorServer]:
-    spec = run_spec().model_copy(update={"service": run_spec().service.model_copy(update={"queue_megabytes": 0.07})})
+    service = run_spec().service.model_copy(update={"queue_megabytes": 0.07})
+    collection = run_spec().collection.model_copy(update={"envs_per_actor": 500})
+    spec = run_spec().model_copy(update={"service": service, "collection": collection})
     opened = ActorServer(
         "r", spec, transport, RunCounters(10), no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
     )

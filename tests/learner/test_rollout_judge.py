@@ -564,6 +564,69 @@ def test_returns_of_episodes_that_did_not_end_are_rejected_as_unfit(harness: Har
     assert_rejected(harness, encode(rollout), "unfit", "7 values, but 0 episodes ended")
 
 
+def ending(sequence: int, length: int, value: float = 1.0) -> bytes:
+    """Return a rollout in whose last row an episode of this length ends in each environment."""
+    no = np.zeros((ROWS, ENVIRONMENTS), np.bool_)
+    ends = no.copy()
+    ends[-1] = True
+    episodes = {
+        "episode_returns": np.full(ENVIRONMENTS, value, np.float32),
+        "episode_lengths": np.full(ENVIRONMENTS, length, np.int64),
+    }
+    return encode(
+        good(rollout_identity=identity(sequence=sequence), terminated=ends, truncated=no, valid=~no, **episodes)
+    )
+
+
+def test_episodes_are_no_longer_than_the_rows_that_the_actor_has_sent(harness: Harness) -> None:
+    """256 episodes of 500 env_steps in a first rollout of 512 rows once ended a run as solved."""
+    assert_rejected(harness, ending(0, ROWS + 1), "unfit", f"has played at most {ROWS} rows in each of its 3 env")
+    twice = Harness()
+    assert isinstance(twice.receive(ending(0, ROWS)), Rollout)
+    assert isinstance(twice.receive(ending(1, ROWS)), Rollout)
+    verdict = twice.receive(ending(2, 2 * ROWS))
+    assert isinstance(verdict, Rejected)
+    assert f"episodes of {6 * ROWS} env_steps, the longest of {2 * ROWS}, and {6 * ROWS} before" in verdict.reason
+    assert_rejected(Harness(), ending(0, 2**62), "unfit", "the longest of 4611686018427387904")
+
+
+def test_rollouts_that_were_lost_count_as_far_as_others_have_arrived(harness: Harness) -> None:
+    """A sequence number alone proves nothing."""
+    assert_rejected(Harness(), ending(10**6, 100 * ROWS), "unfit", f"at most {4 * ROWS} rows")
+    for sequence in range(0, 20, 2):
+        assert isinstance(harness.receive(encode(good(rollout_identity=identity(sequence=sequence)))), Rollout)
+    assert isinstance(harness.receive(ending(20, 15 * ROWS)), Rollout)
+
+
+def test_a_client_may_have_played_rows_that_it_does_not_send() -> None:
+    """As while a person steers: but no more than an environment can play in the time."""
+    fleet = joined_fleet("a", environments=1)
+    judge = RolloutJudge(run_spec(max_policy_lag=MAX_LAG), EPOCH, fleet)
+
+    def verdict(length: int, sequence: int, now: float) -> Upload | Rejected:
+        no, ends = np.zeros((2, ROWS, 1), np.bool_)
+        ends[-1] = True
+        episodes = {"episode_returns": np.ones(1, np.float32), "episode_lengths": np.full(1, length, np.int64)}
+        rollout = good(
+            rollout_identity=identity(sequence=sequence),
+            environments=1,
+            terminated=ends,
+            truncated=no,
+            valid=~no,
+            **episodes,
+        )
+        return judge.decide("a", judge.read("a", encode(rollout)), VERSION, now)
+
+    assert isinstance(verdict(100_000, 0, 1.0), Rollout)
+    assert isinstance(verdict(1_000_000, 1, 10.0), Rejected)
+    assert isinstance(verdict(1_000_000, 1, 200.0), Rollout)
+
+
+@pytest.mark.parametrize("value", [1e12, -3e38])
+def test_returns_that_no_rewards_add_up_to_are_rejected_as_unfit(harness: Harness, value: float) -> None:
+    assert_rejected(harness, ending(0, ROWS, value), "unfit", "rewards within +-1e+09 do not add up to")
+
+
 @pytest.mark.parametrize(
     ("ends", "valid", "reason"),
     [
