@@ -30,7 +30,7 @@ from daedalus.learner.serving.orders import Orders
 from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
-from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.policy.user_modules import NO_MODULES, UserModules, shown_path
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
@@ -291,7 +291,7 @@ class LearnerService:
         if finished:
             server.await_departures(self._stop)
         elif saved:
-            _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saving.directory)
+            _logger.info("stopped; checkpoint saved at %s: %s", env_steps, shown_path(str(saving.directory)))
         return Outcome(
             solved=state.counters.seconds_to_target is not None,
             finished=finished,

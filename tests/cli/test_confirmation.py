@@ -4,7 +4,6 @@ import math
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -150,13 +149,22 @@ def test_learner_that_asks_again_gets_the_result_of_the_version_that_it_asks_for
     assert file.answered(451) is not None
 
 
+class Saved:
+    """A checkpointer whose checkpoints are saved at once."""
+
+    def begin(self) -> None: ...
+
+    def wait(self, *_: object, **__: object) -> bool:
+        return True
+
+
 def test_after_an_attempt_training_goes_on_for_as_long_as_it_took(tmp_path: Path) -> None:
     spec = RunSpec(
         environment=EnvironmentSpec(id="A-v0"), training=TrainingSpec(target_return=475.0, target_episodes=1)
     )
     state, events, stop = RunState(tmp_path, spec, 0.0), EventLog(), threading.Event()
     learner = TargetConfirmation(state, events, stop, lock=threading.Condition(), beat=lambda: None)
-    file, checkpointer = ConfirmationFile(tmp_path), cast("Checkpointer", SimpleNamespace(save=lambda: tmp_path))
+    file, checkpointer = ConfirmationFile(tmp_path), cast("Checkpointer", Saved())
 
     def launch() -> None:
         while not stop.wait(0.3):

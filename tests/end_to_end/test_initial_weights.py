@@ -48,7 +48,7 @@ def test_a_resumed_run_without_checkpoints_begins_with_the_weights_of_the_other_
     refused = start(*words, *addresses, directory=folder)
     assert refused.wait() == (2 if words[0] == "resume" else 1)
     refused.expect(
-        rf"daedalus {words[0]}: the run in \.\./second has no checkpoint, and begins with the weights of another run, "
+        rf"daedalus {words[0]}: the run in \S*/second has no checkpoint, and begins with the weights of another run, "
         r"but /.*/first does not exist"
     )
     assert "Traceback" not in refused.output

@@ -174,7 +174,7 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
     assert int(newest_checkpoint(tmp_path / "run").name) == result["updates"] > int(before.name)
     rows = metrics(tmp_path / "run")
     assert [int(row["env_steps"]) for row in rows] == sorted(int(row["env_steps"]) for row in rows)
-    assert float(rows[-1]["learning_rate"]) == 0.0001
+    assert float(rows[-1]["learning_rate"]) == pytest.approx(0.0001)
     again = wandb_run(tmp_path / "run")
     assert again["id"] == tracked["id"]
     assert again["config"]["training"]["learning_rate_final"] == 0.0001

@@ -160,6 +160,7 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     process, visited = run[0].process, visit(run[0].address)
     page, visited.loses_gateway = visited.page, True
     enter(page, run[0].token)
+    wait_for(page, "document.querySelector('#operator-token').value !== ''")
     assert page.locator("#operator-token").input_value() == run[0].token
     page.locator("#operator-token").fill("wrong")
     page.get_by_role("button", name="Save a checkpoint").click()
