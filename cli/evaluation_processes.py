@@ -100,3 +100,12 @@ def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutp
 def without_episodes(result: dict[str, Any]) -> dict[str, Any]:
     """Return a result of `daedalus evaluate` without the lists of the episodes' returns and lengths."""
     return {name: value for name, value in result.items() if name not in ("returns", "lengths")}
+
+
+def evaluation_summary(evaluation: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """Return what summary.json has of a final evaluation; `more` is about how it was made."""
+    return {
+        "evaluation_return_mean": evaluation["return_mean"],
+        "evaluation_return_std": evaluation["return_std"],
+        "evaluation": {**without_episodes(evaluation), **more},
+    }

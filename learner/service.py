@@ -233,7 +233,7 @@ class LearnerService:
         if difference and not self._allows_other_spaces:
             raise CheckpointMismatchError(
                 f"its policy is for other spaces: {difference}; name a run of the same spaces, or add "
-                "--allow-other-spaces (in Python: allow_other_spaces=True) to load its weights wherever the shapes fit"
+                "--allow-other-spaces (in Python: allow_other_spaces=True) to load its weights if all shapes fit"
             )
         if difference:
             _logger.warning("initial weights of other spaces (--allow-other-spaces): %s", difference)

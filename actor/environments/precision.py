@@ -14,6 +14,7 @@ _MANY_STEPS = 2**16  # enough, however slowly a value changes
 _SMALL_CHANGE = 8  # steps of float32: a change that is smaller is rounded by more than a tenth
 _WHOLE = 2**24  # beyond it float32 does not have every whole number
 _MOST_WHOLE = 2.0**50  # beyond it every float64 is whole, or nearly
+_REWARD_REMEDY = "in a wrapper (--wrap), scale it or subtract a constant before it becomes float32"
 _REMEDY = (
     "in a wrapper (--wrap), subtract a reference, such as the first value of the episode, before it becomes float32; "
     "policy.normalize_observations comes too late for that"
@@ -52,7 +53,9 @@ class Precision:
         """Return what float32 loses, one text for each component at fault; that of the reward has an empty name."""
         found = {**self._of_bounds, **{name: seen.text for name, seen in self._seen.items() if seen.text}}
         return {
-            name: f"{f'observation component {name!r}' if name else 'the reward'} {text}: {_REMEDY}"
+            name: f"observation component {name!r} {text}: {_REMEDY}"
+            if name
+            else f"the reward {text}: {_REWARD_REMEDY}"
             for name, text in found.items()
         }
 

@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -96,13 +96,20 @@ def main(
 
 
 def _record(result: dict[str, Any], directory: Path) -> bool:
-    """Keep a result in a run directory, and return whether that was possible."""
-    from daedalus.learner.run.run_directory import EVALUATION, write_json  # other evaluations need no learner's code
+    """Keep a result in a run directory, as the final evaluation does, and return whether that was possible."""
+    from daedalus.cli.evaluation_processes import evaluation_summary
+    from daedalus.learner.run import run_directory  # other evaluations need no learner's code
+    from daedalus.learner.run.settings import SettingsError
 
+    path = directory / run_directory.EVALUATION
     try:
-        write_json(directory / EVALUATION, result)
+        run_directory.write_json(path, result)
+        with suppress(SettingsError):  # training goes on, or was killed: there is no summary
+            path = directory / run_directory.SUMMARY
+            summary = run_directory.read_json(path)
+            run_directory.write_json(path, {**summary, **evaluation_summary(result)})
     except OSError as error:
-        print_error("evaluate", f"{directory / EVALUATION} cannot be written: {error.strerror}")
+        print_error("evaluate", f"{path} cannot be written: {error.strerror}")
         return False
     return True
 

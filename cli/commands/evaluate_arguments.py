@@ -91,7 +91,8 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--record",
         action="store_true",
-        help="keep the result in the run directory, as the evaluation that report and push show (evaluation.json)",
+        help="keep the result in the run directory, as the evaluation that report, compare and push show "
+        "(evaluation.json)",
     )
     _add_watching(options)
     add_logging(options)
@@ -128,6 +129,8 @@ def check(arguments: argparse.Namespace) -> None:
         raise ValueError("--revision is that of a policy on the Hub: add --from-hub USER/NAME, or leave it out")
     if arguments.record and arguments.directory is None:
         raise ValueError("--record keeps the result in a run directory: name the directory of a run")
+    if arguments.record and arguments.max_seconds is not None:
+        raise ValueError("--record keeps whole episodes, and --max-seconds cuts them: use one of the two")
     if not 1 <= arguments.episodes <= _MOST_EPISODES:
         raise ValueError(f"--episodes is {arguments.episodes}: choose a number from 1 to {_MOST_EPISODES:,}")
     if arguments.envs is not None and not 1 <= arguments.envs <= 4096:

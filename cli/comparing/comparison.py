@@ -1,7 +1,6 @@
 """Comparison of groups of runs: final return, env_steps and minutes to a threshold, improvement. Pure functions."""
 
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from daedalus.cli.comparing.grouping import Group, text
-from daedalus.cli.comparing.recorded_run import ENVIRONMENT
+from daedalus.cli.comparing.recorded_run import ENVIRONMENT, record_command
 from daedalus.cli.comparing.statistics import (
     Strata,
     improvement_interval,
@@ -119,8 +118,8 @@ def incomparable_returns(groups: Sequence[Group]) -> str:
         return ""
     return (
         "final returns cannot be compared: training plays different tasks (environment.training_kwargs or "
-        "environment.no_reward_limit) and not all runs were evaluated; evaluate them, such as with: daedalus resume "
-        f"{shlex.quote(str(without[0].directory))}"
+        "environment.no_reward_limit) and not all runs were evaluated; evaluate them, such as with: "
+        f"{record_command(without[0].directory)}"
     )
 
 

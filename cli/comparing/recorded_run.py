@@ -219,6 +219,11 @@ def _summary(path: Path) -> dict[str, Any]:
     return content
 
 
+def record_command(directory: Path) -> str:
+    """Return the command that evaluates a run and records the result in its directory."""
+    return f"daedalus evaluate {shlex.quote(str(directory))} --record"
+
+
 def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     """Return the columns of metrics.csv, [rows]. The line that a running learner is writing is left out."""
     path = directory / METRICS

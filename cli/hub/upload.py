@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.comparing.recorded_run import SECONDS, one_run, read_run
+from daedalus.cli.comparing.recorded_run import SECONDS, one_run, read_run, record_command
 from daedalus.cli.hub.model_card import model_card
-from daedalus.cli.reports.run_record import RunRecord, read_record, record_command
+from daedalus.cli.reports.run_record import RunRecord, read_record
 from daedalus.learner.reporting.trackers.tracker import flat
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, METRICS, VERSIONS
 from daedalus.learner.run.run_files import RunDataError

@@ -6,7 +6,6 @@ content a report shows as it is are not read through links, which could lead to 
 
 import math
 import os
-import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from daedalus.cli.comparing.recorded_run import RecordedRun
+from daedalus.cli.comparing.recorded_run import RecordedRun, record_command
 from daedalus.learner.run.event_file import RecordedEvent, read_events
 from daedalus.learner.run.run_directory import EVALUATION, EVENTS, OUTPUT, VERSIONS
 from daedalus.learner.run.run_files import RunDataError, read_json
@@ -139,11 +138,6 @@ def _evaluation(directory: Path, run: RecordedRun) -> RecordedEvaluation | None:
             f"{directory / EVALUATION} is damaged ({where}: {first['msg']}): write it again with: "
             f"{record_command(directory)}"
         ) from None
-
-
-def record_command(directory: Path) -> str:
-    """Return the command that evaluates a run and records the result in its directory."""
-    return f"daedalus evaluate {shlex.quote(str(directory))} --record"
 
 
 def _end_of(path: Path) -> str:

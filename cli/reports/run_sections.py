@@ -9,13 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from daedalus.cli.comparing.grouping import text
+from daedalus.cli.comparing.recorded_run import record_command
 from daedalus.cli.reports.axes import written
 from daedalus.cli.reports.charts import histogram
 from daedalus.cli.reports.curves import LARGEST
 from daedalus.cli.reports.episodes import EpisodeStatistics, episode_statistics
 from daedalus.cli.reports.failures import failed_events, failure_counts, together
 from daedalus.cli.reports.markup import Child, Html, element, table
-from daedalus.cli.reports.run_record import RecordedEvaluation, RunRecord, finite, record_command
+from daedalus.cli.reports.run_record import RecordedEvaluation, RunRecord, finite
 from daedalus.learner.run.run_directory import CONFIG
 from daedalus.protocol.redaction import without_secrets
 

@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.evaluation_processes import play, without_episodes
+from daedalus.cli.evaluation_processes import evaluation_summary, play, without_episodes
 from daedalus.cli.running.child_arguments import evaluation_arguments
 from daedalus.cli.running.local_run import LocalRun
 from daedalus.cli.running.sampled_evaluation import is_below_training, other_task_note, sampled_note
@@ -34,10 +34,7 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
         (sampled,) = play([[str(run.directory), *options, "--actions", "sampled"]], stopping, output)
         evaluation["notes"].append(sampled_note(evaluation, sampled))
         summary["sampled_evaluation"] = without_episodes(sampled)
-    summary["evaluation_return_mean"] = evaluation["return_mean"]
-    summary["evaluation_return_std"] = evaluation["return_std"]
-    seconds = time.monotonic() - began
-    summary["evaluation"] = {**without_episodes(evaluation), "select_best": chosen, "seconds": seconds}
+    summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)
     run_directory.write_json(run.directory / run_directory.EVALUATION, evaluation)
     run_directory.write_json(run.directory / run_directory.SUMMARY, summary)
     return summary

@@ -74,6 +74,7 @@ def continue_records(state: RunState, policy_version: int, history: MetricsHisto
     """Undo what the learner processes before recorded after the checkpoint of this policy version; read the rest.
 
     Rows of the metrics and best checkpoints of env_steps that the run makes again would be those of other weights.
+    Scores of episodes with another environment.max_episode_steps are no longer comparable.
     """
     directory, env_steps = state.directory, state.counters.env_steps
     try:
@@ -84,7 +85,8 @@ def continue_records(state: RunState, policy_version: int, history: MetricsHisto
             writer.close()
             state.evaluations.carry_over(rows)
         undone = [f"{len(rows):,} rows of {METRICS}"] if rows else []
-        undone += [f"{each.name}, whose policy is kept" for each in set_aside_newer(directory, policy_version)]
+        comparable = -1 if state.other_episodes else policy_version  # the highest version whose score is
+        undone += [f"{each.name}, whose policy is kept" for each in set_aside_newer(directory, comparable)]
         undone += _remove_later_results(directory, env_steps, policy_version)
         if undone:
             text = f"continues at {env_steps:,} env_steps: undone are {', '.join(undone)}"

@@ -46,6 +46,7 @@ class RunState:
         self.directory, self.name, self.spec, self._started = directory, run_name(directory), spec, started
         self._starts = starts_before + 1
         self.learner_epoch = new_epoch(self._starts)
+        self.other_episodes = False  # than before a resume, so that returns and scores of then say nothing now
         self.counters = RunCounters(spec.training.target_episodes)
         self.annealing = Annealing(budget=spec.training.env_steps)
         self.evaluations = Evaluations(self.learner_epoch, self.counters)
@@ -81,5 +82,9 @@ class RunState:
         """Continue from a result of `saved`, perhaps with other settings than those of the run `before`."""
         self.counters.restore(saved)
         self.counters.forget_target(before.training, self.spec.training)
+        if before.environment.max_episode_steps != self.spec.environment.max_episode_steps:
+            self.other_episodes = True
+            self.counters.forget_returns()
+            self.counters.seconds_to_target = None
         annealing = Annealing(**saved.get("annealing", {"budget": before.training.env_steps}))  # absent in early ones
         self.annealing = annealing.resumed(self.counters.env_steps, self.spec.training.env_steps)

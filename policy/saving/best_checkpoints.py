@@ -118,9 +118,10 @@ def keep_if_best(checkpoint: Path, score: float, policy_version: int, *, trainin
 
 
 def set_aside_newer(run_directory: Path, policy_version: int) -> list[Path]:
-    """Rename the checkpoints that have a score and a higher version than that from which a run continues.
+    """Rename the checkpoints that have a score and a higher version than that from which a run continues; -1: all.
 
-    The run makes these versions again, with other weights. Returns the new paths. Raises OSError.
+    The run makes these versions again, with other weights, or it continues with other episodes, whose scores cannot be
+    compared with these. Returns the new paths. Raises OSError.
     """
     renamed = []
     for checkpoint in [*best_checkpoints(run_directory), *_named(run_directory, training=True)]:

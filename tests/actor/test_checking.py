@@ -437,6 +437,7 @@ def test_numbers_that_float32_merges_are_a_warning(shown: list[Any], space: str,
 def test_rewards_that_float32_merges_are_a_warning() -> None:
     (warning,) = precision_warnings([0.0] * 3, "float64", rewards=[0, 1e8 + 1, 1e8 + 2])
     assert "the reward has the value 100,000,001, which becomes 100,000,000 in float32" in warning
+    assert warning.endswith("scale it or subtract a constant before it becomes float32")
 
 
 @pytest.mark.parametrize(

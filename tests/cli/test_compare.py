@@ -99,7 +99,7 @@ def test_returns_of_different_tasks_are_not_compared(folder: Path, capsys: pytes
     output = capsys.readouterr().out
     assert [line.split()[1:5] for line in output.splitlines()[2:4]] == [["1", "-", "-", "-"]] * 2
     assert "final returns cannot be compared: training plays different tasks" in output
-    assert "daedalus resume " in output
+    assert "such as with: daedalus evaluate " in output
     record(folder / "same", settings=["environment.no_reward_limit=9"], seed=2, evaluation=None)
     assert compare(["shaped", "same"]) == 0
     assert "cannot be compared" not in capsys.readouterr().out

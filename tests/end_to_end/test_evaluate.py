@@ -258,7 +258,11 @@ def test_a_recorded_evaluation_replaces_that_of_the_run(tmp_path: Path, evaluate
     run = save(tmp_path / "run", CARTPOLE, 1)
     write_config(run, RunSpec(environment=CARTPOLE))
     (run / "evaluation.json").write_text("of another time")
+    (run / "summary.json").write_text('{"env_steps": 7, "evaluation_return_mean": 1.0}')
     result = evaluate(run, "--episodes", 2, "--record")
+    summary = json.loads((run / "summary.json").read_text())  # what compare reads
+    assert (summary["env_steps"], summary["evaluation_return_mean"]) == (7, result["return_mean"])
+    assert summary["evaluation"]["policy_version"] == result["policy_version"]
     assert read_json(run / "evaluation.json") == result
 
 
@@ -554,6 +558,7 @@ def test_a_signal_ends_an_evaluation(start: Start, tmp_path: Path) -> None:
         (["RUN", "--video", "x.mp4", "--backend", "envpool"], 2, "leave out --backend envpool"),
         (["RUN", "--video", "x.mp4", "--width", 3], 2, "--width is 3: choose a number from 16 to 4096"),
         (["RUN", "--video", "x.mp4", "--max-seconds", 0], 2, "--max-seconds is 0: choose a number above 0"),
+        (["RUN", "--video", "x.mp4", "--max-seconds", 5, "--record"], 2, "--max-seconds cuts them: use one of"),
         (["RUN", "--max-seconds", 5], 2, "need --video FILE"),
         (["RUN", "--backend", "ale"], 1, "unknown environment 'CartPole-v1'"),
         (["nowhere"], 1, "nowhere does not exist: name a run directory"),

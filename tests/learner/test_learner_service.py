@@ -449,6 +449,19 @@ def test_a_resumed_run_undoes_what_came_after_its_checkpoint(tmp_path: Path) -> 
     assert "undone are 2 rows of metrics.csv" in event.text
 
 
+def test_returns_of_episodes_with_another_limit_say_nothing_after_a_resume(tmp_path: Path) -> None:
+    TrainingRun(tmp_path, **annealed(300)).finish()
+    run, checkpoint = tmp_path / "run", load_newest(tmp_path / "run")
+    keep_if_best(checkpoint.policy.directory, 400.0, 1)
+    settings = annealed(600)
+    settings["environment"]["max_episode_steps"] = 5
+    TrainingRun(tmp_path, restored=checkpoint, **settings).finish()
+    assert all(best_score(each) <= 5.0 for each in best_checkpoints(run))
+    assert read_json(run / "summary.json")["episode_return_mean"] <= 5.0
+    (event,) = [event for event in read_events(run) if event.text.startswith("resumed: ")]
+    assert "undone_best_400.0_0000000001, whose policy is kept" in event.text
+
+
 def test_resuming_with_a_learning_rate_of_0_is_reported(tmp_path: Path) -> None:
     settings = annealed(100)
     settings["training"]["learning_rate_final"] = 0.0
