@@ -115,6 +115,7 @@ class ConfirmedRange:
     Moments whose magnitude is above ten times all that the votes show are of a past that nothing confirms, such as a
     bad first rollout: they are forgotten. And a vote 1e5 times above everything that any *other* actor has ever shown,
     and above 1, is far outside: it is none, and its rollout has nothing to learn from. A single actor has no others.
+    Unless most of the other owners have shown such a size too, or been far outside with it: then it is rare, and real.
 
     The votes are not saved: after a resume, the restored moments stand in for them until an actor has 8 votes or there
     is a second one.
@@ -126,6 +127,7 @@ class ConfirmedRange:
         self._most_voters = min(max(_VOTE_NUMBERS // (2 * self._votes * numbers), 2), 64)
         self._voters: dict[str, _Voter] = {}  # by actor, the one that was heard last at the end
         self._heard = 0  # votes so far
+        self._far: dict[str, np.ndarray] = {}  # largest magnitudes [*shape] that were far outside, by owner
         self._summary: _Summary | None = None
 
     def add(self, actor: str, moments: Moments) -> None:
@@ -158,7 +160,22 @@ class ConfirmedRange:
         if sum(len(voter.means) for voter in others) < _FEW_VOTES:
             return False
         largest = np.max([voter.largest for voter in others], 0).clip(min=1.0)
-        return bool((magnitude > _FAR * largest).any())
+        if not (magnitude > _FAR * largest).any():
+            return False
+        known = self._shown_by_most(owner(actor))
+        claimed = np.maximum(magnitude, self._far.pop(owner(actor), magnitude))
+        self._far[owner(actor)] = claimed
+        if len(self._far) > self._most_voters:
+            del self._far[next(iter(self._far))]
+        return bool((magnitude > np.maximum(_FAR * largest, _LARGEST_RATIO * known)).any())
+
+    def _shown_by_most(self, but: str) -> np.ndarray:
+        """Return the magnitude that more than half of the owners but one have shown, in votes or far outside."""
+        shown = {name: value for name, value in self._far.items() if name != but}
+        for name, voter in self._voters.items():
+            if owner(name) != but:
+                shown[owner(name)] = np.maximum(voter.largest, shown.get(owner(name), voter.largest))
+        return np.sort(list(shown.values()), 0)[(len(shown) - 1) // 2] if shown else np.zeros(())
 
     def forget_unconfirmed(self, moments: RunningMoments) -> None:
         """Forget running moments that are far above all votes, if these are of enough rows to say so."""

@@ -17,6 +17,9 @@ _NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # Windows has no FIFOs in folders
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 _SHARING = "checkpoints"  # whose folders have files in common: those of the best
 _SEARCHED = (_SHARING, "logs")  # of a run, and of a sweep
+# Names and endings of the files of a run. Some are only written at the end of the run: a folder would lose the result.
+_FILES = {"heartbeat", "operator-token"}
+_FILE_ENDINGS = {".toml", ".json", ".jsonl", ".csv", ".log", ".lock"}
 _REMEDY = "remove it, or copy the directory without it"
 
 
@@ -60,10 +63,17 @@ def append_own(path: Path, *, private: bool = False) -> FileIO:
 def foreign_entry(directory: Path) -> str:
     """Return what is in a directory that no run writes there, with what to do, or an empty string.
 
-    That is a link, a FIFO, a device or a socket, and a file that has a name elsewhere, too. Of the folders in it, only
-    our own are searched: those of a tracker have links of its own. Raises OSError.
+    That is a link, a FIFO, a device or a socket, a file that has a name elsewhere, too, a folder where a run has a
+    file, and a file where it has a folder. Of the folders in it, only our own are searched: those of a tracker have
+    links of its own. Raises OSError.
     """
     entries = list(os.scandir(directory))
+    for entry in entries:
+        is_folder, path = entry.is_dir(follow_symlinks=False), Path(entry.name)
+        if is_folder and (path.name in _FILES or path.suffix in _FILE_ENDINGS):
+            return f"{entry.name} is a folder, but a run has a file of this name: {_REMEDY}"
+        if entry.name == _SHARING and entry.is_file(follow_symlinks=False):
+            return f"{entry.name} is a file, but a run has a folder of this name: {_REMEDY}"
     shared = set[str]()
     for entry in list(entries):
         if entry.name in _SEARCHED and entry.is_dir(follow_symlinks=False):

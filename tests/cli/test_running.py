@@ -74,7 +74,7 @@ def test_a_run_that_failed_after_a_checkpoint_says_how_to_continue_it(
     monkeypatch.setattr(train_command, "run_locally", fail)
     monkeypatch.setattr(new_run, "checked_spaces", lambda *_, **_others: None)
     monkeypatch.setattr(train_command, "configure_logging", lambda *_, **_others: None)
-    monkeypatch.setattr(train_command, "stop_on_signals", threading.Event)
+    monkeypatch.setattr(train_command, "stop_on_signals", lambda **_: threading.Event())
     monkeypatch.setattr(train_command.signal, "signal", lambda *_: None)
     assert train_command.train(["cartpole", "--run-dir", str(directory)]) == 1
     assert capsys.readouterr().err.splitlines() == [

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
@@ -156,3 +157,31 @@ def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_
             assert process.wait(SECONDS) == status
         finally:
             process.kill()
+
+
+# A file system that does not answer holds the thread that reads the learner's question.
+HUNG_DISK = """
+    import sys, time
+    from daedalus.cli.commands import train
+    from daedalus.learner.run.confirmation_file import ConfirmationFile
+    def asked(self):
+        print("reading", flush=True)
+        time.sleep(1000)
+    ConfirmationFile.asked = asked
+    train._DISK_SECONDS = 0.2
+    sys.exit(train.train(["cartpole", "--run-dir", sys.argv[1]]))
+"""
+
+
+def test_launcher_ends_although_the_disk_does_not_answer(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", textwrap.dedent(HUNG_DISK), str(tmp_path / "run")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as launcher:  # the pipe ends with the last process of it
+        try:
+            assert launcher.stdout is not None
+            while launcher.stdout.readline() not in (b"reading\n", b""):
+                pass
+            launcher.send_signal(signal.SIGTERM)
+            assert launcher.wait(SECONDS) == 1
+            launcher.stdout.read()
+        finally:
+            launcher.kill()

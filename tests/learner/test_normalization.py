@@ -396,6 +396,18 @@ def test_rare_rewards_that_are_much_larger_are_neither_far_outside_nor_forgotten
     assert (1000.0 / votes.deviation > 3.0).all()
 
 
+@pytest.mark.parametrize("actors", ["ab", "abc", "abcdefgh"])
+def test_rare_honest_numbers_far_outside_are_not_rejected_for_ever(actors: str) -> None:
+    """A component that is 0, but for one row in 500."""
+    votes, rejected = Votes(), list[int]()
+    for turn in range(1200):
+        found = votes.random.random((100, 1)) < 0.002
+        votes.send(actors[turn % len(actors)], np.tile(1e7 * found, 2))
+        rejected.append(len(votes.far))
+    assert 0 < rejected[300] == rejected[-1]
+    assert (votes.deviation > 1e5).all()
+
+
 def test_restored_statistics_stand_in_for_the_votes() -> None:
     """After a resume the first rollout may be the bad one."""
     votes = Votes()

@@ -82,6 +82,17 @@ def test_linked_folder_is_foreign_and_that_of_a_tracker_is_not_searched(tmp_path
     assert foreign_entry(run) == "checkpoints is a link: remove it, or copy the directory without it"
 
 
+@pytest.mark.parametrize("name", ["config.toml", "evaluation.json", "metrics.csv", "learner.lock", "operator-token"])
+def test_folder_where_a_run_has_a_file_is_foreign(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir()
+    assert foreign_entry(tmp_path).startswith(f"{name} is a folder, but a run has a file of this name: remove it")
+
+
+def test_file_in_place_of_the_checkpoints_is_foreign(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").touch()
+    assert foreign_entry(tmp_path).startswith("checkpoints is a file, but a run has a folder of this name: remove it")
+
+
 def test_own_file_is_appended_to(tmp_path: Path) -> None:
     for _ in range(2):
         with append_own(tmp_path / "events.jsonl") as file:
