@@ -8,9 +8,10 @@ PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
-# Two processes share the tests; those of one file run in one process, because they share what they start.
+# Four processes share the tests, also on two cores: many tests wait for the processes that they start. The tests of one
+# file run in one process, because they share what they start.
 test: check
-	$(BIN)/pytest --numprocesses 2 --dist loadfile
+	$(BIN)/pytest --numprocesses 4 --dist loadfile
 
 # Trackio needs an older pillow than constraints.txt: for its test it is installed into a folder of its own.
 test-trackio: .venv/ready-test

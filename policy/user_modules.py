@@ -169,7 +169,8 @@ def _restore(state: tuple[Any, ...], now: tuple[Any, ...]) -> None:
 
 def _undone_state() -> tuple[Any, ...]:
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    torch = sys.modules.get("torch")
+    # Another thread may be importing it, such as a learner's in the same process: then this waits until it has.
+    torch = importlib.import_module("torch") if "torch" in sys.modules else None
     return handlers, sys.getrecursionlimit(), torch and (torch.get_default_dtype(), torch.get_default_device())
 
 

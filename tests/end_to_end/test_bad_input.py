@@ -17,18 +17,14 @@ Start = Callable[..., Running]
     ("words", "status", "message"),
     [
         (["train", "cartpol"], 2, r"unknown preset 'cartpol': did you mean cartpole"),
-        (["train"], 2, r"name a preset \(.*cartpole.*\) or an environment with --env ID"),
         (
             ["train", "cartpole", "--set", "training.learning_rat=1"],
             2,
             r"did you mean training\.learning_rate",
         ),
-        (["train", "cartpole", "--set", "training.learning_rate=7"], 2, r"must be above 0 and at most 1"),
         (["train", "cartpole", "--set", "learning_rate=7"], 2, r"write section.key=value"),
-        (["train", "cartpole", "--algorithm", "a4c"], 2, "training.algorithm must be one of a2c, a3c, impala, appo"),
         (["learner", "cartpole", "--algorithm", "absent:A"], 2, "training.algorithm=absent:A: cannot import absent"),
         (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
-        (["train", "nothing.toml"], 2, r"nothing.toml does not exist"),
         (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
         (["train", "cartpole", "--init-from", "nowhere"], 2, r"--init-from: nowhere does not exist"),
         (["evaluate", "nowhere"], 1, r"nowhere does not exist: name a run directory"),
@@ -117,10 +113,8 @@ def test_an_address_in_use_is_reported(start: Start, address: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_with_examples(start: Start, command: str) -> None:
-    running = start(command, "--help")
-    assert running.wait() == 0
-    running.expect("examples:")
+def test_every_command_has_help_with_examples(command: str) -> None:
+    assert "examples:" in COMMANDS[command].make_parser().format_help()
 
 
 def test_help_of_a_command_that_reserves_its_output_can_be_piped() -> None:
