@@ -1,6 +1,7 @@
 """An actor that is authorised and hostile: it joins a run on CartPole, and sends whatever rollouts it is told to."""
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.messages import Acknowledgement, Join, Message, Welcome
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.protocol.uploads import Rollout, RolloutIdentity
+from daedalus.protocol.uploads import Rollout, RolloutIdentity, Upload
 from daedalus.transport.zenoh_transport import connect
 
 _SPACES = Spaces(
@@ -21,23 +22,30 @@ _TIMEOUT = 30.0
 
 
 class HostileActor:
-    """One actor with one environment, on a session of its own."""
+    """One actor, on a session of its own."""
 
-    def __init__(self, address: str, name: str) -> None:
-        self._transport = connect([address])
+    spaces = _SPACES
+
+    def __init__(self, address: str, name: str, environments: int = 1) -> None:
+        self._transport, self.environments = connect([address]), environments
         self._name, self._incarnation = name, 0
         self._version = 0  # the newest policy version that an answer named
-        self.join()
+        try:
+            self.join()
+        except RuntimeError:
+            self.close()  # or this process would not end
+            raise
 
     def join(self) -> None:
         """Join as a new incarnation, with a clean record."""
         self._incarnation += 1
         self._sequence = 0
-        join = Join(actor=self._name, incarnation=self._incarnation, spaces=_SPACES, environments=1)
+        join = Join(actor=self._name, incarnation=self._incarnation, spaces=_SPACES, environments=self.environments)
         welcome = self._ask(keys.join("run", self._name), join)
         if not isinstance(welcome, Welcome):
             raise RuntimeError(f"the learner refused the actor: {welcome}")
-        self._epoch, self.rows = welcome.learner_epoch, welcome.spec.collection.rollout_length
+        self._epoch, self.spec = welcome.learner_epoch, welcome.spec
+        self.rows = welcome.spec.collection.rollout_length
 
     def be_present(self) -> None:
         """Declare presence: from now on the learner regards this actor as live."""
@@ -45,10 +53,11 @@ class HostileActor:
 
     def send(self, **replaced: Any) -> Acknowledgement:
         """Send a rollout in which no episode ends, with some arrays replaced, until the learner decides on it."""
-        rows, cells = self.rows, (self.rows, 1)
+        rows, count = self.rows, self.environments
+        cells = (rows, count)
         content: dict[str, Any] = {
-            "frames": {"observation": np.zeros((rows + 1, 1, 4), np.float32)},
-            "initial_state": np.zeros((1, 0), np.float32),
+            "frames": {"observation": np.zeros((rows + 1, count, 4), np.float32)},
+            "initial_state": np.zeros((count, 0), np.float32),
             "actions": {"action": np.zeros((*cells, 1), np.uint8)},
             "masks": {},
             "behaviour_log_probs": np.full(cells, -0.7, np.float32),
@@ -59,17 +68,21 @@ class HostileActor:
             "episode_returns": np.zeros(0, np.float32),
             "episode_lengths": np.zeros(0, np.int32),
         }
+        made = {**content, **replaced}
+        return self.upload(lambda identity, version: Rollout(identity=identity, policy_version=version, **made))
+
+    def upload(self, make: Callable[[RolloutIdentity, int], Upload], *, wait: bool = True) -> Acknowledgement:
+        """Send what `make` returns for an identity and a policy version; `wait` until the learner decides on it."""
         while True:
             identity = RolloutIdentity(
                 actor=self._name, incarnation=self._incarnation, sequence=self._sequence, learner_epoch=self._epoch
             )
             self._sequence += 1
-            rollout = Rollout(identity=identity, policy_version=self._version, **{**content, **replaced})
-            answer = self._ask(keys.rollouts("run", self._name), rollout)
+            answer = self._ask(keys.rollouts("run", self._name), make(identity, self._version))
             if not isinstance(answer, Acknowledgement):
                 raise RuntimeError(f"the learner answered {answer}")
             self._version = max(self._version, answer.policy_version)
-            if answer.verdict != "busy" and not answer.reason.startswith("policy lag"):
+            if not wait or (answer.verdict != "busy" and not answer.reason.startswith("policy lag")):
                 return answer
             time.sleep(0.01)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from lucky_environment import BUSY, UNLUCKY, WAITING
-from processes import Running, processes_mentioning, until
+from processes import Running, free_address, processes_mentioning, until
 
 from daedalus.learner.run.event_file import read_events
 
@@ -50,6 +50,19 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     assert asked == confirmed == running.lines[first]
     assert refused == "not confirmed: return 0; training continues"
     running.expect("confirmation: return 1 over 10 new sampled episodes of the policy at that moment")
+
+
+def test_a_learner_without_launcher_confirms_its_target_too(start: Start, tmp_path: Path) -> None:
+    """It is alone with what actors report."""
+    shutil.copy(Path(__file__).parent.parent / "lucky_environment.py", tmp_path)
+    (tmp_path / UNLUCKY).touch()
+    address = free_address()
+    words = ("--env", "lucky_environment:Lucky-v0", "--listen", address, "--run-dir", "run", *WORDS)
+    learner = start("learner", *words)
+    start("actor", "--connect", address, "--allow-module", "lucky_environment")
+    learner.expect("not confirmed: return 0; training continues")
+    assert learner.wait() == 0, learner.output
+    assert summary(tmp_path)["confirmation_return_mean"] == 1.0
 
 
 def test_run_ends_at_its_target_if_the_episodes_cannot_be_played(train: Callable[..., Running], tmp_path: Path) -> None:
