@@ -15,7 +15,7 @@ from daedalus.algorithms.forward import Forward
 from daedalus.algorithms.minibatches import Minibatch
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.algorithms import AlgorithmRecord
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.spec import LossSpec
 
 __all__ = ["Algorithm", "Forward", "Losses", "MinibatchLosses"]
 
@@ -60,7 +60,7 @@ class Algorithm:
     # Tensors that change in `after_update`: a checkpoint saves them by name, and restores them in place.
     statistics: Mapping[str, Tensor] = MappingProxyType({})
 
-    def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
+    def __init__(self, spec: LossSpec, distribution: ActionDistribution) -> None:
         """Construct the algorithm.
 
         Args:
@@ -75,7 +75,7 @@ class Algorithm:
         """Yield the losses of each update of a batch, in order. The observations of the batch are normalised.
 
         The caller changes the parameters between two updates, so losses are computed only when the caller asks for
-        the next update. The number of updates is that of `TrainingSpec.updates_from`.
+        the next update. The number of updates is that of `LossSpec.updates_from`.
 
         Args:
           batch: T rows of B environments. `batch.observations`, `batch.initial_state` and `batch.starts` are the

@@ -22,7 +22,7 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.algorithms import is_own
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.spec import LossSpec
 
 _MOST_ROWS = 32  # of a recorded sequence: a memory takes long to record, 5 ms for each row, and gains little
 
@@ -39,9 +39,7 @@ class Terms(NamedTuple):
 class GradientComputer:
     """Gradient computation of one algorithm for one network."""
 
-    def __init__(
-        self, spec: TrainingSpec, network: ActorCritic, spaces: Spaces, modules: UserModules = NO_MODULES
-    ) -> None:
+    def __init__(self, spec: LossSpec, network: ActorCritic, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
         """Raise AlgorithmError if the user's own algorithm cannot be used; `modules` may be imported for it."""
         self._spec, self._network = spec, network
         self._algorithm = build_algorithm(spec, network.distribution, modules)
@@ -58,8 +56,14 @@ class GradientComputer:
         self._recorder = OperationRecorder()
         self._first_pass: FirstPass | None = None  # of the newest batch
         if is_own(spec.algorithm):
-            updates, state_size = (lambda batch: self.compute(batch, spec.entropy_bonus)), network.state_size
-            check_updates(spec, updates, self._try_after_update, spaces, state_size)
+            device = self.parameters.values.device
+            check_updates(
+                spec,
+                lambda batch: self.compute(batch.to(device), spec.entropy_bonus),
+                self._try_after_update,
+                spaces,
+                network.state_size,
+            )
             self._first_pass = None
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:

@@ -14,7 +14,7 @@ from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.spec import LossSpec
 
 _SETTING = "training.algorithm"
 _ROWS, _ENVIRONMENTS = 3, 2  # of the trial
@@ -38,7 +38,7 @@ def own_class(name: str, modules: UserModules) -> type[Algorithm]:
     return found
 
 
-def own_algorithm(spec: TrainingSpec, distribution: ActionDistribution, modules: UserModules) -> Algorithm:
+def own_algorithm(spec: LossSpec, distribution: ActionDistribution, modules: UserModules) -> Algorithm:
     """Return the user's algorithm that `spec.algorithm` names. Raises AlgorithmError."""
     kind: Any = own_class(spec.algorithm, modules)
     try:
@@ -48,7 +48,7 @@ def own_algorithm(spec: TrainingSpec, distribution: ActionDistribution, modules:
 
 
 def check_updates(
-    spec: TrainingSpec,
+    spec: LossSpec,
     updates: Callable[[Batch], Iterator[object]],
     after_update: Callable[[], None],
     spaces: Spaces,
@@ -71,7 +71,7 @@ def check_updates(
     expected = spec.updates_from(_ENVIRONMENTS if state_size else _ROWS * _ENVIRONMENTS)
     try:
         with torch.random.fork_rng(devices=()):  # the run itself begins with the random state of its seed
-            made = sum(1 for _ in updates(batch.to(torch.device(spec.device))))
+            made = sum(1 for _ in updates(batch))
             after_update()
     except Exception as error:  # the user's code may raise anything
         raise _fault(spec.algorithm, error) from error

@@ -12,7 +12,7 @@ from daedalus.algorithms.own_algorithm import own_algorithm
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.algorithms import is_own
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.spec import LossSpec
 
 CLASSES: dict[str, type[Algorithm]] = {
     "a2c": A2c,
@@ -25,9 +25,7 @@ CLASSES: dict[str, type[Algorithm]] = {
 }
 
 
-def build_algorithm(
-    spec: TrainingSpec, distribution: ActionDistribution, modules: UserModules = NO_MODULES
-) -> Algorithm:
+def build_algorithm(spec: LossSpec, distribution: ActionDistribution, modules: UserModules = NO_MODULES) -> Algorithm:
     """Return the algorithm named by `spec.algorithm`, for a policy with these action distributions.
 
     `modules` may be imported. Raises AlgorithmError for an algorithm of the user's own that cannot be constructed.

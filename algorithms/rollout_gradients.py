@@ -19,7 +19,7 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.compact import bfloat16, float32, planes
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import LearningSpec
 from daedalus.protocol.uploads import LARGEST_GRADIENT_NORM, Gradient, Rollout
 
 _CONSTRUCTION = threading.Lock()
@@ -33,10 +33,10 @@ class RolloutGradients:
     long run. Seide et al. (2014), section 2.
     """
 
-    def __init__(self, spec: RunSpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
+    def __init__(self, spec: LearningSpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
         """Raise NetworkError or AlgorithmError if the network or the algorithm cannot be constructed here."""
         torch.set_num_threads(1)
-        training = spec.training.model_copy(update={"device": "cpu"})
+        training = spec.training
         # A learner in the same process draws numbers of its own: leave them as they were. The lock is for several
         # actors, of which one would otherwise restore what another has drawn.
         with _CONSTRUCTION, torch.random.fork_rng(devices=()):
@@ -48,7 +48,7 @@ class RolloutGradients:
         if training.normalize_rewards:
             self._rewards = RewardNormalizer(training.discount_factor, synchronous=training.record.synchronous)
         self._actions = ActionCounts(spaces, torch.device("cpu"))
-        self._in_float32 = spec.algorithm.synchronous
+        self._in_float32 = training.record.synchronous
         self._parameters = dict(self._network.named_parameters())
         target = self._computer.forward.target_parameters
         self._loaded = {**self._parameters, **{TARGET + name: values for name, values in target.items()}}

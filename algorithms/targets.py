@@ -4,10 +4,10 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.returns import Targets, actor_critic_targets, vtrace_targets
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.spec import LossSpec
 
 
-def lambda_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
+def lambda_targets(spec: LossSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
     """Return lambda-returns and their advantages, as if the behaviour policy were the target policy.
 
     Where actors explore, rows are weighted by min(rho_clip, pi / mu): random actions of an actor are then no more
@@ -25,7 +25,7 @@ def lambda_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: 
     return targets._replace(weights=(log_probs - batch.behaviour_log_probs).exp().clamp(max=spec.rho_clip))
 
 
-def vtrace_corrected_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
+def vtrace_corrected_targets(spec: LossSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
     """Return V-trace targets and advantages, corrected for the lag of the behaviour policy.
 
     Args:

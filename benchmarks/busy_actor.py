@@ -24,10 +24,10 @@ def main() -> None:
     spec = run_spec(settings)
     collector = EnvironmentCollector()
     try:
-        spaces, _ = collector.prepare(spec)
+        spaces, _ = collector.prepare(spec.for_actors())
         network = ActorCritic(spec.policy, spaces)
         weights = {name: parameter.detach().numpy() for name, parameter in network.named_parameters()}
-        collector.begin(OnnxRuntime(export_program(network, spaces)), spec, seed=1)
+        collector.begin(OnnxRuntime(export_program(network, spaces)), spec.for_actors(), seed=1)
         collector.load(Snapshot(learner_epoch=1, policy_version=0, program="", weights=weights))
         sequence = 0
         print("busy", flush=True)

@@ -87,8 +87,8 @@ def limit(spec: RunSpec, seconds: float) -> tuple[float, dict[str, float]]:
     state, size = np.zeros((count, runtime.state_size), np.float32), runtime.noise_size
     acting = per_call(lambda _: runtime.act(seen.frames, state, draw_noise(size, count, random), seen.masks), seconds)
     collector = EnvironmentCollector()
-    collector.prepare(spec)
-    collector.begin(runtime, spec, 1)
+    collector.prepare(spec.for_actors())
+    collector.begin(runtime, spec.for_actors(), 1)
     collector.load(Snapshot(learner_epoch=1, policy_version=0, program="", weights=learner.weights()))
     identity = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
     batch = [copy.deepcopy(collector.collect(identity, lambda: None)) for _ in range(spec.collection.actors)]

@@ -22,7 +22,7 @@ from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.messages import Join, Welcome
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 
 
 class ClientActor:
@@ -53,7 +53,7 @@ class ClientActor:
 
     # --------------------------------------------------------------------------------------------- joining
 
-    def prepare(self, spec: RunSpec) -> tuple[Join, Transforms]:
+    def prepare(self, spec: ActorSpec) -> tuple[Join, Transforms]:
         """Return the request to join a run, and the transforms of its spaces. Raises ClientError if they do not fit."""
         mask = None if self.spaces.example_mask is None else mask_of_one(self.spaces.example_mask)
         try:

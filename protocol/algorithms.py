@@ -1,8 +1,8 @@
 """The algorithms by name: what a process must know of one to schedule its work, without any mathematics.
 
 The learner's buffers, the actors and the command line read these records; the losses are in daedalus/algorithms. The
-record of an algorithm of the user's own is an attribute of its class; the specification of the run carries it to the
-actors, which do not import the class.
+record of an algorithm of the user's own is an attribute of its class; ActorSpec carries what it demands to the actors,
+which do not import the class.
 """
 
 import difflib
@@ -17,13 +17,20 @@ Heads = Literal["policy_and_value", "action_values"]
 Epsilons = Annotated[tuple[UnitInterval, ...], Field(min_length=1, max_length=64)]
 
 
-class AlgorithmRecord(Specification):
+class ActorDemands(Specification):
+    """What one algorithm demands of actors."""
+
+    synchronous: bool = False
+    """Actors wait for each update; a batch is one rollout of every live actor (a barrier)."""
+    next_action: bool = False
+    """Targets need the action of the next row (Sarsa), so that a rollout has at least two rows."""
+
+
+class AlgorithmRecord(ActorDemands):
     """What one algorithm needs of the network, of the actors and of the schedule of updates. Immutable."""
 
     summary: Annotated[str, Field(max_length=200)] = ""
     """One line for `--help`."""
-    synchronous: bool = False
-    """Actors wait for each update; a batch is one rollout of every live actor (a barrier)."""
     corrected: bool = False
     """Targets are corrected for policy lag (V-trace)."""
     passes_over_batch: bool = False
@@ -36,8 +43,6 @@ class AlgorithmRecord(Specification):
     """`action_values`: the head computes Q(s, a) of each choice, and the policy is greedy; there is no value head."""
     target_network: bool = False
     """The learner keeps a second network, which `Algorithm.after_update` sets and which gradients do not change."""
-    next_action: bool = False
-    """Targets need the action of the next row (Sarsa), so that a rollout has at least two rows."""
     epsilons: Epsilons = (0.0,)
     """The epsilons that actors draw theirs from where `training.exploration` is unset."""
     exploration_share: UnitInterval = 0.0

@@ -2,7 +2,7 @@
 
     offset  bytes
          0      4  magic b"DAED"
-         4      2  protocol version, little-endian
+         4      2  lowest protocol version whose readers can read the message, little-endian
          6      2  0: the body is plain, 1: the body is one zstd frame
          8      4  length of the header, little-endian
         12      -  header: one msgpack map {"kind", "fields", "arrays", "size"}, padded with zeros to 8; each
@@ -34,7 +34,8 @@ from daedalus.protocol.messages import CompactSnapshot, Message, Origin, Program
 from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import Gradient, Rollout
 
-PROTOCOL_VERSION = 11
+PROTOCOL_VERSION = 11  # that this release reads, besides all from FIRST_VERSION on; docs/wire.md says when to raise it
+FIRST_VERSION = 11  # of messages whose readers ignore what they do not know
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")
@@ -57,18 +58,28 @@ class ProtocolError(Exception):
 
 
 class VersionMismatchError(ProtocolError):
-    """The other end uses another version of the protocol."""
+    """The message needs another version of the protocol."""
 
     def __init__(self, theirs: int) -> None:
         super().__init__(
             f"the other end uses protocol version {theirs}, this one {PROTOCOL_VERSION}: "
-            "install the same release of daedalus-rl on both"
+            "upgrade daedalus-rl at the end with the lower version"
         )
         self.theirs = theirs
 
 
+class UnfitMessageError(ProtocolError):
+    """The message has this form, but a value of it does not fit this release."""
+
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(f"{kind}: {reason}")
+        self.kind = kind
+
+
 def encode(message: Message) -> bytes:
     """Encode a message.
+
+    Its version is FIRST_VERSION, or its `lowest_version` if its class has that property.
 
     Raises ValueError for an array whose dtype the protocol does not support, and for a header that no reader accepts:
     faults of the caller.
@@ -97,14 +108,15 @@ def encode(message: Message) -> bytes:
         if len(smaller) < len(body):
             flags, body = _ZSTD, smaller
     padding = bytes(-(_PREFIX.size + len(header)) % _ALIGNMENT)
-    return b"".join((_PREFIX.pack(_MAGIC, PROTOCOL_VERSION, flags, len(header)), header, padding, body))
+    version = getattr(message, "lowest_version", FIRST_VERSION)
+    return b"".join((_PREFIX.pack(_MAGIC, version, flags, len(header)), header, padding, body))
 
 
 def decode(data: bytes, limits: Limits) -> Message:
-    """Decode a message; its arrays are read-only.
+    """Decode a message; its arrays are read-only. Fields and arrays that its class does not have are ignored.
 
-    Raises VersionMismatchError if another protocol version wrote it, and ProtocolError if the bytes are not exactly one
-    complete and consistent message within `limits`. No input raises any other exception.
+    Raises VersionMismatchError if this release cannot read its version, and ProtocolError if the bytes are not exactly
+    one complete and consistent message within `limits`. No input raises any other exception.
     """
     flags, header, body = _split(data, limits)
     kind, fields, arrays, size = _read_header(header)
@@ -113,15 +125,14 @@ def decode(data: bytes, limits: Limits) -> Message:
     if flags == _ZSTD and _KINDS[kind] not in _COMPRESSED:
         raise ProtocolError(f"a {kind} must not be compressed")
     layout = _read_layout(arrays, size, limits)
-    buffers = _read_arrays(layout, _plain_body(flags, body, size))
+    known = [entry for entry in layout if schema.has_array(_KINDS[kind], entry.name)]
+    buffers = _read_arrays(known, _plain_body(flags, body, size))
     try:
         message = schema.unpack(_KINDS[kind], fields, "", buffers)
     except ValidationError as error:
-        raise ProtocolError(f"{kind}: {_first_fault(error)}") from None
+        raise UnfitMessageError(kind, _first_fault(error)) from None
     except ValueError as error:
-        raise ProtocolError(f"{kind}: {error}") from None
-    if buffers:
-        raise ProtocolError(f"{kind} has no array {next(iter(buffers))!r}")
+        raise UnfitMessageError(kind, str(error)) from None
     return message
 
 
@@ -169,7 +180,7 @@ def _split(data: bytes, limits: Limits, *, any_version: bool = False) -> tuple[i
     magic, version, flags, header_length = _PREFIX.unpack_from(data)
     if magic != _MAGIC:
         raise ProtocolError("not a message of this protocol")
-    if version != PROTOCOL_VERSION and not any_version:
+    if not FIRST_VERSION <= version <= PROTOCOL_VERSION and not any_version:
         raise VersionMismatchError(version)
     if flags not in (_PLAIN, _ZSTD):
         raise ProtocolError(f"unknown flags {flags}")
@@ -203,7 +214,8 @@ def _first_fault(error: ValidationError) -> str:
     count = error.error_count()
     if count > _MAX_DESCRIBED:
         return f"{count:,} values are not valid"
-    return error.errors()[0]["msg"]
+    first = error.errors()[0]
+    return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
 
 
 class _Entry(NamedTuple):

@@ -14,7 +14,7 @@ from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.metrics import MetricsReport, MetricsRequest
 from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
 from daedalus.protocol.uploads import EPISODE_DTYPES, Gradient, Rollout
 
@@ -57,7 +57,7 @@ class Welcome:
     run: str
     learner_epoch: int  # identifies this process of the learner; rollouts for another epoch are fenced
     seed: int  # for the environments and samples of this incarnation of the actor
-    spec: RunSpec
+    spec: ActorSpec
     epsilon: float = 0.0  # probability with which this actor takes a random action in the end; 0: it does not explore
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """Converting messages to plain maps and named arrays, and back, by the type annotations of the message classes.
 
 Scalars, strings, nested messages and pydantic models go into the map; arrays are named by their path. Building a
-message checks the type of every field. This file does not encode bytes.
+message checks the type of every field that it has, and ignores all others. This file does not encode bytes.
 """
 
 import dataclasses
@@ -37,11 +37,12 @@ def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[st
 def unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.ndarray]) -> Any:
     """Build a message of class `cls` from a map made by `pack`, and remove its arrays from `arrays`.
 
-    Raises ValueError, which names the field, for a field that is missing, unknown or of the wrong type.
+    A missing field has its default. Fields that the class does not have are ignored: a newer release wrote them.
+    Raises ValueError, which names the field, for one that is missing without a default, or of the wrong type.
     """
     values: dict[str, Any] = {}
-    expected = _fields(cls)
-    for name, annotation in expected.items():
+    optional = _optional(cls)
+    for name, annotation in _fields(cls).items():
         if annotation is np.ndarray:
             if path + name not in arrays:
                 raise ValueError(f"array {path + name!r} is missing")
@@ -52,14 +53,19 @@ def unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.nd
             prefix = f"{path}{name}/"
             found = [key for key in arrays if key.startswith(prefix)]
             values[name] = {key[len(prefix) :]: arrays.pop(key) for key in found}
-        elif name not in fields:
-            raise ValueError(f"field {path + name!r} is missing")
-        else:
+        elif name in fields:
             values[name] = _value(annotation, fields[name], path + name, arrays)
-    unknown = [name for name in fields if name not in expected]
-    if unknown:
-        raise ValueError(f"unknown field {path + str(unknown[0])!r}")
+        elif name not in optional:
+            raise ValueError(f"field {path + name!r} is missing")
     return cls(**values)
+
+
+def has_array(cls: type, name: str) -> bool:
+    """Return whether messages of class `cls` have an array with this name."""
+    annotation = _fields(cls).get(name.partition("/")[0])
+    if "/" in name:
+        return _is_array_map(annotation)
+    return annotation is np.ndarray or _is_optional_array(annotation)
 
 
 def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
@@ -72,7 +78,7 @@ def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray])
             raise ValueError(f"field {path!r} must be a map")
         return unpack(typing.cast(type, annotation), item, path + ".", arrays)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation.model_validate(item)
+        return annotation.model_validate(item, extra="ignore")
     if typing.get_origin(annotation) is typing.Literal:
         if not isinstance(item, str) or item not in typing.get_args(annotation):
             raise ValueError(f"field {path!r} must be one of {', '.join(typing.get_args(annotation))}")
@@ -88,6 +94,17 @@ def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray])
 def _fields(cls: type) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+@functools.cache
+def _optional(cls: type) -> frozenset[str]:
+    """Return the names of the fields that have a default."""
+    missing = dataclasses.MISSING
+    return frozenset(
+        field.name
+        for field in dataclasses.fields(cls)
+        if field.default is not missing or field.default_factory is not missing
+    )
 
 
 def _is_optional_array(annotation: Any) -> bool:

@@ -1,25 +1,36 @@
 """Specification of a run: every setting of the environment, the policy, the training and the service.
 
 One frozen model per concern, checked at construction; unknown fields are errors. The learner owns the
-specification and sends all of it to every actor that joins. The docstring below a field is its description in the
-reference of all settings. This file does not know where a specification comes from (a preset, a file, the command
-line) or how it is used.
+specification and sends ActorSpec, the part that actors need, to every actor that joins. The docstring below a field is
+its description in the reference of all settings. This file does not know where a specification comes from (a preset, a
+file, the command line) or how it is used.
 """
 
 import math
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import AfterValidator, Field, JsonValue, model_validator
+import msgpack
+from pydantic import AfterValidator, Field, JsonValue, ValidationError, model_validator
 
-from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, Epsilons, check_algorithm, is_own
+from daedalus.protocol.algorithms import ALGORITHMS, ActorDemands, AlgorithmRecord, Epsilons, check_algorithm, is_own
+from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.spaces import ComponentName
-from daedalus.protocol.spec_size import check_size
-from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
+from daedalus.protocol.specification import (
+    NaturalInt,
+    PositiveInt,
+    Specification,
+    UnitInterval,
+    changed_fields,
+    has_field,
+)
+from daedalus.protocol.texts import bounded_text
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]
 FrameStackSize = Annotated[int, Field(ge=1, le=16)]
 _OBJECT = r"\w+(\.\w+)*:\w+"  # module:name
+_Part = TypeVar("_Part", bound=Specification)
+_MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcome, and the names of the settings
 
 
 def _check_environment_id(value: str) -> str:
@@ -161,8 +172,8 @@ class CollectionSpec(Specification):
     then need torch. Not for `impala`, `appo`, and algorithms of your own that are corrected or make several passes."""
 
 
-class TrainingSpec(Specification):
-    """How the learner learns, and when it stops."""
+class LossSpec(Specification):
+    """The settings of `training` that a gradient is computed from: actors that upload gradients need them too."""
 
     algorithm: Annotated[str, Field(max_length=200), AfterValidator(check_algorithm)] = "impala"
     """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: PPO, asynchronous, in several passes;
@@ -172,26 +183,6 @@ class TrainingSpec(Specification):
     """Further arguments of the constructor of an algorithm of your own."""
     algorithm_record: AlgorithmRecord | None = None
     """Schedule of an algorithm of your own, for the actors. Taken from the class: leave it unset."""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
-    """Seed of the network, the environments and the actions."""
-    env_steps: PositiveInt = 1_000_000
-    """Budget: env_steps over all actors."""
-    target_return: float | None = None
-    """The target is reached when the mean return of the last `target_episodes` episodes reaches this value. Where
-    actors explore, it is also reached when the mean return of an evaluation does; where they play another task than
-    evaluations (`environment.training_kwargs`, `environment.no_reward_limit`), only then. `daedalus train` confirms it
-    with as many new episodes."""
-    target_episodes: PositiveInt = 100
-    """Number of newest training episodes in the mean return."""
-    stop_when_solved: bool = True
-    """Stop when `target_return` is reached. Otherwise use the whole budget."""
-
-    batch_rollouts: PositiveInt | None = None
-    """Rollouts in a batch. Unset: `collection.actors` for `impala` and `appo`, 1 for the others. Not for `a2c`."""
-    max_policy_lag: NaturalInt | None = None
-    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 8 batches for `a3c` and the
-    methods of action values, of 32 for the others; of more where the live actors can have more than half as many in
-    flight."""
 
     discount_factor: UnitInterval = 0.99
     """Discount of the reward of the next step."""
@@ -221,9 +212,6 @@ class TrainingSpec(Specification):
     """Epsilons: each actor draws one, by the seed and its name, and takes a random legal action with that probability.
     Repeat a number to make it more probable. Unset: 0.1, 0.01 or 0.5 with the probabilities 0.4, 0.3 and 0.3 for action
     values; no exploration for the other algorithms, whose policies are random themselves."""
-    exploration_env_steps: NaturalInt | None = None
-    """Env_steps of all actors together in which epsilon falls linearly from 1 to the number that the actor drew; 0: it
-    has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
 
     value_loss: Literal["mse", "huber"] = "mse"
     """Loss of the value, or of the action values."""
@@ -231,8 +219,6 @@ class TrainingSpec(Specification):
     """Weight of that loss."""
     entropy_bonus: Annotated[float, Field(ge=0.0)] = 0.01
     """Weight of the policy's entropy."""
-    entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
-    """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
     normalize_rewards: bool = False
     """Divide rewards by the running standard deviation of the discounted return, or by a fifth of its mean if that is
     larger, so that values are near one."""
@@ -240,25 +226,8 @@ class TrainingSpec(Specification):
     """Scale the advantages of each batch to mean 0 and standard deviation 1. With `collection.upload=gradients`, each
     actor scales those of each rollout."""
 
-    optimizer: Literal["adam", "rmsprop"] = "adam"
-    """Optimiser of the network's parameters."""
-    learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
-    """Learning rate at the start."""
-    learning_rate_final: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
-    """Anneal the learning rate linearly to this value over the budget. Unset: constant."""
-    optimizer_epsilon: Annotated[float, Field(gt=0.0)] = 1e-5
-    """Epsilon of the optimiser."""
-    rmsprop_decay: UnitInterval = 0.99
-    """Decay of the mean squared gradient; `rmsprop` only."""
-    max_gradient_norm: Annotated[float, Field(gt=0.0)] = 0.5
-    """Clip the gradient of an update to this norm."""
-
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the learner."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Precision of the forward passes. `auto`: bfloat16 for convolutions where the hardware multiplies it."""
-    threads: PositiveInt = 1
-    """Threads of the learner. More than one is slower if actors use the same cores."""
 
     @property
     def user_modules(self) -> dict[str, str]:
@@ -280,17 +249,6 @@ class TrainingSpec(Specification):
         """Whether an actor may take random actions besides those of its policy."""
         return max(self.epsilons) > 0.0
 
-    def exploration_annealing(self, progress: float, env_steps: int) -> float:
-        """Return how much of epsilon's way from 1 to its final value is left, from 1 to 0.
-
-        `progress` is the share of the budget that is used (learner/run/annealing.py), and `env_steps` their number.
-        """
-        if self.exploration_env_steps is None:
-            used, end = progress, self.record.exploration_share
-        else:
-            used, end = env_steps, self.exploration_env_steps
-        return max(1.0 - used / end, 0.0) if end else 0.0
-
     @property
     def updates_per_batch(self) -> int:
         """Number of policy versions that one batch produces, if the batch is not smaller than its minibatches."""
@@ -304,8 +262,67 @@ class TrainingSpec(Specification):
         return self.passes * min(self.minibatches, parts) if self.record.passes_over_batch else 1
 
 
-class EvaluationSpec(Specification):
-    """Evaluator that `daedalus train` runs beside the actors, on episodes that training never uses."""
+class TrainingSpec(LossSpec):
+    """How the learner learns, and when it stops."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    """Seed of the network, the environments and the actions."""
+    env_steps: PositiveInt = 1_000_000
+    """Budget: env_steps over all actors."""
+    target_return: float | None = None
+    """The target is reached when the mean return of the last `target_episodes` episodes reaches this value. Where
+    actors explore, it is also reached when the mean return of an evaluation does; where they play another task than
+    evaluations (`environment.training_kwargs`, `environment.no_reward_limit`), only then. `daedalus train` confirms it
+    with as many new episodes."""
+    target_episodes: PositiveInt = 100
+    """Number of newest training episodes in the mean return."""
+    stop_when_solved: bool = True
+    """Stop when `target_return` is reached. Otherwise use the whole budget."""
+
+    batch_rollouts: PositiveInt | None = None
+    """Rollouts in a batch. Unset: `collection.actors` for `impala` and `appo`, 1 for the others. Not for `a2c`."""
+    max_policy_lag: NaturalInt | None = None
+    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 8 batches for `a3c` and the
+    methods of action values, of 32 for the others; of more where the live actors can have more than half as many in
+    flight."""
+    exploration_env_steps: NaturalInt | None = None
+    """Env_steps of all actors together in which epsilon falls linearly from 1 to the number that the actor drew; 0: it
+    has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
+    entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
+    """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
+
+    optimizer: Literal["adam", "rmsprop"] = "adam"
+    """Optimiser of the network's parameters."""
+    learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
+    """Learning rate at the start."""
+    learning_rate_final: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    """Anneal the learning rate linearly to this value over the budget. Unset: constant."""
+    optimizer_epsilon: Annotated[float, Field(gt=0.0)] = 1e-5
+    """Epsilon of the optimiser."""
+    rmsprop_decay: UnitInterval = 0.99
+    """Decay of the mean squared gradient; `rmsprop` only."""
+    max_gradient_norm: Annotated[float, Field(gt=0.0)] = 0.5
+    """Clip the gradient of an update to this norm."""
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Device of the learner."""
+    threads: PositiveInt = 1
+    """Threads of the learner. More than one is slower if actors use the same cores."""
+
+    def exploration_annealing(self, progress: float, env_steps: int) -> float:
+        """Return how much of epsilon's way from 1 to its final value is left, from 1 to 0.
+
+        `progress` is the share of the budget that is used (learner/run/annealing.py), and `env_steps` their number.
+        """
+        if self.exploration_env_steps is None:
+            used, end = progress, self.record.exploration_share
+        else:
+            used, end = env_steps, self.exploration_env_steps
+        return max(1.0 - used / end, 0.0) if end else 0.0
+
+
+class EvaluatorSpec(Specification):
+    """The settings of `evaluation` that an evaluator needs."""
 
     seconds: Annotated[float, Field(gt=0.0)] | None = None
     """Seconds from the start of one evaluation to the start of the next. Unset: no evaluator."""
@@ -316,6 +333,11 @@ class EvaluationSpec(Specification):
     max_episode_env_steps: PositiveInt = 27_000
     """Cut episodes of evaluations after this many env_steps, and report how many were cut: the environment may never
     end them. The default is Atari's half an hour, at four frames a step."""
+
+
+class EvaluationSpec(EvaluatorSpec):
+    """Evaluator that `daedalus train` runs beside the actors, on episodes that training never uses."""
+
     final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Episodes of the evaluation of the best policy after training."""
     final_backend: Backend | None = None
@@ -340,6 +362,70 @@ class ServiceSpec(Specification):
         return int(self.queue_megabytes * 2**20)
 
 
+class LearningSpec(Specification):
+    """Settings of the network and of the loss: what an actor with torch needs besides the others."""
+
+    policy: PolicySpec = PolicySpec()
+    training: LossSpec = LossSpec()
+
+    @property
+    def user_modules(self) -> dict[str, str]:
+        """Settings that name a module as `module:name`, with their values."""
+        return {**self.policy.user_modules, **self.training.user_modules}
+
+
+class UnsupportedRunError(ValueError):
+    """The run has a setting that this release does not know or cannot apply."""
+
+
+class ActorSpec(Specification):
+    """What an actor needs to know of a run: the learner sends it in Welcome.
+
+    The learner and the actor may be of different releases, so an actor ignores settings that it does not know, unless
+    the run uses them: `changed` names all settings that differ from their defaults.
+    """
+
+    environment: EnvironmentSpec
+    collection: CollectionSpec = CollectionSpec()
+    evaluation: EvaluatorSpec = EvaluatorSpec()
+    algorithm: ActorDemands = ActorDemands()
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1  # of the run
+    max_upload_bytes: NaturalInt = 1 << 26  # the learner does not receive larger messages
+    # The fields of LearningSpec, unchecked: most actors do not need them, and may not know each encoder and algorithm.
+    learning: dict[str, JsonValue] = Field(default_factory=dict)
+    changed: Annotated[tuple[str, ...], Field(max_length=4096)] = ()  # paths, such as `environment.grey`
+
+    @property
+    def uploads_gradients(self) -> bool:
+        """Whether actors upload gradients instead of rollouts."""
+        return self.collection.upload == "gradients"
+
+    def check_known(self) -> None:
+        """Raise UnsupportedRunError if the run uses a setting of a newer release, except in `learning`."""
+        _refuse_unknown([path for path in self.changed if not path.startswith("learning.")], ActorSpec)
+
+    @property
+    def learning_settings(self) -> LearningSpec:
+        """The settings in `learning`. Raises UnsupportedRunError if this release does not know one that is used."""
+        _refuse_unknown([path[9:] for path in self.changed if path.startswith("learning.")], LearningSpec)
+        try:
+            return LearningSpec.model_validate(self.learning, extra="ignore")
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = ".".join(map(str, first["loc"]))
+            reason = bounded_text(f"{name} does not fit this release: {first['msg']}")
+            raise UnsupportedRunError(f"the run's {reason}") from None
+
+
+def _refuse_unknown(paths: list[str], model: type[Specification]) -> None:
+    unknown = [path for path in paths if not has_field(model, path)]
+    if unknown:
+        names = bounded_text(", ".join(unknown[:3]), 150)
+        raise UnsupportedRunError(
+            f"the run sets {names}, which this release does not know: upgrade daedalus-rl here to the learner's release"
+        )
+
+
 class RunSpec(Specification):
     """Complete specification of a run, written as `config.toml`, which reproduces the run."""
 
@@ -358,7 +444,20 @@ class RunSpec(Specification):
 
     @model_validator(mode="after")
     def _fits_one_message(self) -> "RunSpec":
-        check_size(self.model_dump(mode="json"))
+        sizes: dict[str, int] = {}
+        for section, settings in self.model_dump(mode="json").items():
+            for name, value in settings.items():
+                try:
+                    sizes[f"{section}.{name}"] = len(msgpack.packb(value) or b"")
+                except (ValueError, OverflowError) as error:  # such as an integer of more than 64 bits
+                    raise ValueError(f"{section}.{name} cannot be sent to actors: {error}") from None
+        total = sum(sizes.values())
+        if total > _MAX_BYTES:
+            largest = max(sizes, key=lambda name: sizes[name])
+            raise ValueError(
+                f"{largest} has {sizes[largest]:,} bytes, too many to send to actors: all settings together may have "
+                f"{_MAX_BYTES:,}, and have {total:,}"
+            )
         return self
 
     @model_validator(mode="after")
@@ -421,6 +520,20 @@ class RunSpec(Specification):
                 raise ValueError(f"environment.wrap needs gymnasium's environments: {setting} is {backend}")
         return self
 
+    def for_actors(self) -> ActorSpec:
+        """Return what actors need. A new setting of a section below reaches them; any other only the learner reads."""
+        learning = self.learning
+        spec = ActorSpec(
+            environment=self.environment,
+            collection=self.collection,
+            evaluation=_part(EvaluatorSpec, self.evaluation),
+            algorithm=_part(ActorDemands, self.algorithm),
+            seed=self.training.seed,
+            max_upload_bytes=min(self.service.queue_bytes, 2**63 - 1),
+        )
+        changed = (*changed_fields(spec), *changed_fields(learning, "learning."))
+        return spec.model_copy(update={"learning": learning.model_dump(mode="json"), "changed": changed})
+
     @property
     def user_modules(self) -> dict[str, str]:
         """Settings that name a module as `module:name`, with their values."""
@@ -435,6 +548,11 @@ class RunSpec(Specification):
     def actor_modules(self) -> dict[str, str]:
         """Those of `user_modules` that an actor imports: with gradients, also the learner's."""
         return self.user_modules if self.uploads_gradients else self.environment.user_modules
+
+    @property
+    def learning(self) -> LearningSpec:
+        """Settings of the network and of the loss."""
+        return LearningSpec(policy=self.policy, training=_part(LossSpec, self.training))
 
     @property
     def uploads_gradients(self) -> bool:
@@ -463,3 +581,8 @@ class RunSpec(Specification):
         actors = max(self.collection.actors, live)
         in_flight = math.ceil(actors * self.collection.window / self.batch_rollouts)  # batches
         return max(self.algorithm.max_lag_batches, 2 * in_flight) * training.updates_per_batch
+
+
+def _part(part: type[_Part], whole: _Part) -> _Part:
+    """Return the fields of a base class of a specification."""
+    return part.model_construct(**{name: getattr(whole, name) for name in part.model_fields})

@@ -32,11 +32,11 @@ def started_collector(
     run = RunSpec(environment=spec, collection=CollectionSpec(envs_per_actor=count, rollout_length=rollout_length))
     collector = EnvironmentCollector(modules=modules)
     if environments is None:
-        collector.prepare(run)
+        collector.prepare(run.for_actors())
     else:
         with mock.patch.object(environment_collector, "make_environments", return_value=environments):
-            collector.prepare(run)
-    collector.begin(runtime, run, seed)
+            collector.prepare(run.for_actors())
+    collector.begin(runtime, run.for_actors(), seed)
     collector.load(snapshot(0, weights or {}))
     return collector
 

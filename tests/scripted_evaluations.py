@@ -66,7 +66,7 @@ class ScriptedLearner:
         message = decode(request.payload, Limits())
         assert isinstance(message, Join)
         self.joins.put(message)
-        request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec)))
+        request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec.for_actors())))
 
     def _program(self, request: Request) -> None:
         request.reply(encode(Program(hash=program_hash(MODEL), model=np.frombuffer(MODEL, np.uint8))))

@@ -87,7 +87,9 @@ class ScriptedLearner:
         assert isinstance(message, Join)
         self.joins.put(message)
         epsilon = self.epsilons.get(message.actor, 0.0)
-        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=self.spec)
+        answer: Message = Welcome(
+            run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=self.spec.for_actors()
+        )
         request.reply(encode(self.refusal or answer))
 
     def _report(self, request: Request) -> None:

@@ -19,7 +19,7 @@ from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 
@@ -69,7 +69,7 @@ class ClientCollector:
         """Whether a learner has accepted the client, and its program has come."""
         return self._program is not None
 
-    def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
+    def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
         """See Collector."""
         check_run(spec)
         example = None if self._example_mask is None else mask_of_one(self._example_mask)
@@ -78,14 +78,14 @@ class ClientCollector:
             agent.watch(without(self._observation_space, spec.environment.leave_out))
         return self._transforms.spaces, len(self.agents) if spec.algorithm.synchronous else 1
 
-    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
+    def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Discard the rollouts of the previous policy."""
         assert isinstance(runtime, OnnxRuntime)  # a client has no other
         self._program = runtime
         rows = [self._rows(agent, spec, (seed, index), epsilon) for index, agent in enumerate(self.agents)]
         self._exchange.begin(rows, together=spec.algorithm.synchronous)
 
-    def _rows(self, agent: ClientAgent, spec: RunSpec, seed: tuple[int, int], epsilon: float) -> ClientRows:
+    def _rows(self, agent: ClientAgent, spec: ActorSpec, seed: tuple[int, int], epsilon: float) -> ClientRows:
         assert self._transforms is not None
         assert self._program is not None
 

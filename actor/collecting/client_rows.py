@@ -11,7 +11,7 @@ from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.errors import ActorError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
-from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.spec import ActorSpec, EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)
@@ -215,7 +215,7 @@ class ClientRows:
             self._on_full(self._writer)
 
 
-def check_run(spec: RunSpec) -> None:
+def check_run(spec: ActorSpec) -> None:
     """Raise ActorError if a loop that somebody else owns cannot take part in a run."""
     if spec.uploads_gradients:
         raise ActorError(
@@ -240,7 +240,7 @@ def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
 
 
 def make_client_rows(
-    spec: RunSpec,
+    spec: ActorSpec,
     transforms: Transforms,
     runtime: PolicyRuntime,
     random: np.random.Generator,

@@ -6,21 +6,21 @@ from typing import Protocol
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 
 class Collector(Protocol):
     """A source of rollouts for one learner after the other. Its methods are for the service's thread."""
 
-    def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
+    def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
         """Prepare for a run, and return its spaces and E, the number of environments.
 
         Raises EnvironmentSetupError or ActorError if this actor cannot take part in the run.
         """
         ...
 
-    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
+    def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """Collect with a policy from now on; `load` provides its weights before the first rollout.
 
         `seed` is the `entropy` of the learner's Welcome, and `epsilon` is its own.

@@ -11,7 +11,7 @@ from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.spec import ActorSpec, EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _SEEDS = 2**31  # every seed of an environment is below it: many environments pass theirs to a C int
@@ -37,7 +37,7 @@ class EnvironmentCollector:
         self._writer: RolloutWriter | None = None
         self._policy_version = -1
 
-    def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
+    def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
         """See Collector. Reuse the environments of an earlier run with the same specification and number of them."""
         count = self._count or spec.collection.envs_per_actor
         requested = (spec.environment, count)
@@ -48,7 +48,7 @@ class EnvironmentCollector:
             self._requested = requested
         return self._environments.spaces, self._environments.count
 
-    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
+    def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Reset the environments."""
         environments = self._environments
         assert environments is not None

@@ -15,7 +15,7 @@ from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_no
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 
 _SAMPLES, _FEW_SAMPLES = 64, 8  # of the action, for its probabilities; few where the observation is large
 _LARGE = 4096  # numbers in an observation
@@ -47,7 +47,7 @@ class Moment:
 class EpisodeCamera:
     """Episodes of one environment, rendered."""
 
-    def __init__(self, spec: RunSpec, modules: UserModules, estimate: Estimate = _unknown) -> None:
+    def __init__(self, spec: ActorSpec, modules: UserModules, estimate: Estimate = _unknown) -> None:
         """Make the environment. Raises EnvironmentSetupError.
 
         `estimate` returns the value of observations [1, *stacked_shape] and the policy's memory [1, S].

@@ -84,7 +84,7 @@ class Evaluator:
                     self._end.wait(min(due - now, _POLL_SECONDS))
                 due = time.monotonic() + interval
                 # An actor's seed is made of other numbers: no episode of training is evaluated here.
-                seed = int(np.random.SeedSequence([welcome.seed, spec.training.seed, number]).generate_state(1)[0])
+                seed = int(np.random.SeedSequence([welcome.seed, spec.seed, number]).generate_state(1)[0])
                 if not self._evaluate(welcome, environments, seed):
                     return
         finally:

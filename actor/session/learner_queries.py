@@ -11,7 +11,7 @@ from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError,
 from daedalus.actor.session.run_end import DRAINED, RunEndWatch, RunOverError
 from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError, VersionMismatchError, decode, encode
+from daedalus.protocol.codec import ProtocolError, UnfitMessageError, VersionMismatchError, decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.messages import (
     Acknowledgement,
@@ -24,6 +24,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
+from daedalus.protocol.spec import UnsupportedRunError
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.slow_calls import SlowCall
@@ -145,6 +146,8 @@ class LearnerQueries:
         if len(names) > 1:
             raise ActorError(f"several learners answer here ({', '.join(names)}): choose one with --run")
         if welcomes:
+            for welcome in welcomes:
+                self._check_known(welcome, join)
             return sorted(welcomes, key=lambda welcome: welcome.learner_epoch, reverse=True)
         _raise_if_over(answers)
         for refusal in answers:
@@ -154,6 +157,15 @@ class LearnerQueries:
                 kind = NameInUseError if refusal.code == "name_taken" else ActorRefusedError
                 raise kind(f"the learner refused this actor: {bounded_text(refusal.reason, MAX_ANSWER_TEXT)}")
         return []
+
+    def _check_known(self, welcome: Welcome, join: Join) -> None:
+        """Raise ActorError, and report it, if the run has settings of a newer release."""
+        try:
+            welcome.spec.check_known()
+        except UnsupportedRunError as error:
+            failure = ActorError(str(error))
+            self.report_failure(welcome.run, join, failure)
+            raise failure from None
 
     def report_failure(self, run: str, join: Join, error: Exception) -> None:
         """Report why this actor ends, for the status of the run. Does nothing if the learner itself is the cause."""
@@ -207,13 +219,18 @@ class LearnerQueries:
     def decode(self, data: bytes) -> Message | None:
         """Return the message in `data`; log damaged data and return None.
 
-        Raises ActorError if the learner speaks another version of the protocol.
+        Raises ActorError if the learner's release is another one, of which this actor can apply no message or not all
+        settings of the run.
         """
         try:
             return decode(data, LEARNER_LIMITS)
         except VersionMismatchError as error:
             raise ActorError(str(error)) from None
         except ProtocolError as error:
+            if isinstance(error, UnfitMessageError) and error.kind == Welcome.__name__:
+                raise ActorError(
+                    f"this release cannot play the run ({error}): upgrade daedalus-rl here to the learner's release"
+                ) from None
             _logger.warning("ignored a damaged message: %s", error)
             return None
 

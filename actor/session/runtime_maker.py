@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 
+from daedalus.actor.errors import ActorError
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch
@@ -13,6 +14,7 @@ from daedalus.actor.session.snapshot_source import FIRST_PUSH_SECONDS, MISSED_PU
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.protocol.messages import Welcome
 from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import UnsupportedRunError
 
 _logger = logging.getLogger(__name__)
 
@@ -42,7 +44,11 @@ class RuntimeMaker:
         if self._config.runtime == "torch":
             from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
 
-            return TorchRuntime(welcome.spec.policy, spaces, welcome.spec.training)
+            try:
+                learning = welcome.spec.learning_settings
+            except UnsupportedRunError as error:
+                raise ActorError(str(error)) from None
+            return TorchRuntime(learning.policy, spaces, learning.training)
         rows = environments * welcome.spec.collection.rollout_length  # a rollout is played with one snapshot
         return OnnxRuntime(self._await_program(welcome), self._stop, rows)
 

@@ -29,7 +29,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Snapshot, Welcome
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import Transport
 
@@ -242,12 +242,12 @@ class ActorService:
             )
 
 
-def _check_size(payload: bytes, spec: RunSpec) -> None:
+def _check_size(payload: bytes, spec: ActorSpec) -> None:
     """Raise ActorError if the learner does not receive messages of this size: they would be lost in silence."""
-    if len(payload) > spec.service.queue_bytes:
+    if len(payload) > spec.max_upload_bytes:
         raise ActorError(
             f"a rollout of this actor has {len(payload) / 2**20:.1f} MiB, and the learner takes at most "
-            f"{spec.service.queue_megabytes:g} MiB: set fewer environments (collection.envs_per_actor, "
+            f"{spec.max_upload_bytes / 2**20:g} MiB: set fewer environments (collection.envs_per_actor, "
             "or --envs of daedalus actor) or shorter rollouts (collection.rollout_length), or raise "
             "service.queue_megabytes of the run"
         )

@@ -7,7 +7,7 @@ import numpy as np
 from daedalus.actor.errors import ActorError
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec, UnsupportedRunError
 from daedalus.protocol.uploads import Rollout, Upload
 
 
@@ -34,7 +34,7 @@ class RolloutUploadMaker:
         return rollout
 
 
-def make_upload_maker(spec: RunSpec, spaces: Spaces, modules: UserModules) -> UploadMaker:
+def make_upload_maker(spec: ActorSpec, spaces: Spaces, modules: UserModules) -> UploadMaker:
     """Return what makes the uploads that a run asks for. Only gradients import torch.
 
     `modules` may be imported for the network and the algorithm. Raises ActorError if the actor cannot compute
@@ -43,11 +43,12 @@ def make_upload_maker(spec: RunSpec, spaces: Spaces, modules: UserModules) -> Up
     if not spec.uploads_gradients:
         return RolloutUploadMaker()
     try:
-        modules.check(spec.learner_modules)
+        learning = spec.learning_settings
+        modules.check(learning.user_modules)
         from daedalus.algorithms.errors import AlgorithmError
         from daedalus.algorithms.rollout_gradients import RolloutGradients
         from daedalus.policy.network.errors import NetworkError
-    except UserModuleError as error:
+    except (UnsupportedRunError, UserModuleError) as error:
         raise ActorError(str(error)) from None
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "torch":
@@ -57,6 +58,6 @@ def make_upload_maker(spec: RunSpec, spaces: Spaces, modules: UserModules) -> Up
             "pip install 'daedalus-rl[learner]', or set collection.upload=rollouts"
         ) from None
     try:
-        return RolloutGradients(spec, spaces, modules)
+        return RolloutGradients(learning, spaces, modules)
     except (AlgorithmError, NetworkError) as error:
         raise ActorError(str(error)) from None

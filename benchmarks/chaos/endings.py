@@ -117,7 +117,12 @@ def _unplayable_run(here: Scene, number: int, refused: Callable[[], bool]) -> No
 def _two_runs(here: Scene, number: int, refused: Callable[[], bool]) -> None:
     answer = [
         encode(
-            Welcome(run=f"{name}-{number}", learner_epoch=1, seed=1, spec=RunSpec(environment=EnvironmentSpec(id="x")))
+            Welcome(
+                run=f"{name}-{number}",
+                learner_epoch=1,
+                seed=1,
+                spec=RunSpec(environment=EnvironmentSpec(id="x")).for_actors(),
+            )
         )
         for name in ("one", "two")
     ]

@@ -79,8 +79,10 @@ class LocalActor:
         self._spec, self.name = spec, name
         self._sequence = 0
         self._collector = EnvironmentCollector()
-        self.spaces, _ = self._collector.prepare(spec)
-        self._gradients = RolloutGradients(spec, self.spaces) if spec.collection.upload == "gradients" else None
+        self.spaces, _ = self._collector.prepare(spec.for_actors())
+        self._gradients = (
+            RolloutGradients(spec.learning, self.spaces) if spec.collection.upload == "gradients" else None
+        )
 
     def begin(self, program: bytes, seed: int, epsilon: float = 0.0) -> None:
         """Reset the environments.
@@ -90,7 +92,7 @@ class LocalActor:
             seed: of the environments and of the actions.
             epsilon: with which the actor explores in the end.
         """
-        self._collector.begin(OnnxRuntime(program), self._spec, seed, epsilon)
+        self._collector.begin(OnnxRuntime(program), self._spec.for_actors(), seed, epsilon)
 
     def play(self, snapshot: Snapshot) -> Rollout | Gradient:
         """Return what the learner receives of a rollout under a snapshot. A rollout is valid until the next call."""

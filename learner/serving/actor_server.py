@@ -93,7 +93,9 @@ class ActorServer:
         self.history = MetricsHistory()
         self._orders = orders or Orders(threading.Event())
         self._status = StatusResponses(run, learner_epoch, status, self.fleet, self.lock, self.events, self.history)
-        self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock, self.events)
+        self._responses = QueryResponses(
+            run, spec.for_actors(), learner_epoch, start_version, self.fleet, self.lock, self.events
+        )
         start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
             run, spec, transport, self._responses, self.fleet, self.lock, counters, **start

@@ -14,7 +14,7 @@ from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
 from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS
 from daedalus.protocol.messages import Acknowledgement, Join, Origin, Program, Refusal, Welcome
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.status import EventKind
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 
@@ -25,7 +25,7 @@ class QueryResponses:
     def __init__(
         self,
         run: str,
-        spec: RunSpec,
+        spec: ActorSpec,
         learner_epoch: int,
         start_version: int,
         fleet: Fleet,

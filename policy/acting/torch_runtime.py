@@ -8,13 +8,13 @@ from daedalus.policy.acting.runtime import Choice, PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
-from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.spec import LossSpec, PolicySpec
 
 
 class TorchRuntime:
     """Runs the network with torch on one thread."""
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces, training: TrainingSpec | None = None) -> None:
+    def __init__(self, spec: PolicySpec, spaces: Spaces, training: LossSpec | None = None) -> None:
         """Raise PolicyError if the network cannot be built, or has code that the user supplies.
 
         `training` is as for ActorCritic.

@@ -15,7 +15,7 @@ from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.spec import LossSpec, PolicySpec
 
 _POLICY_GAIN = 0.01  # the initial policy is nearly uniform for every observation
 
@@ -28,7 +28,7 @@ class ActorCritic(nn.Module):
     """
 
     def __init__(
-        self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES, training: TrainingSpec | None = None
+        self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES, training: LossSpec | None = None
     ) -> None:
         """Construct the network.
 

@@ -20,8 +20,11 @@ def begun(played: Played) -> tuple[ClientCollector, list[Robot]]:
     environments = [gymnasium.make(played.spec.environment.id, ends=ends).unwrapped for ends in ENDS]
     spaces = environments[0].observation_space, environments[0].action_space
     client = ClientCollector(*spaces, None, agents=AGENTS)
-    assert client.prepare(played.spec) == (played.spaces, AGENTS if played.spec.algorithm.synchronous else 1)
-    client.begin(played.runtime(), played.spec, 3)
+    assert client.prepare(played.spec.for_actors()) == (
+        played.spaces,
+        AGENTS if played.spec.algorithm.synchronous else 1,
+    )
+    client.begin(played.runtime(), played.spec.for_actors(), 3)
     client.load(played.snapshot(0))
     return client, [Robot(environment, environment.reset(seed=1)[0]) for environment in environments]
 
@@ -160,8 +163,8 @@ def test_one_agent_of_a_synchronous_run_is_an_actor_with_one_environment(setting
     played = synchronous(Played(run_spec(**settings)))
     client, robots = begun(played)
     alone = ClientCollector(robots[0].environment.observation_space, robots[0].environment.action_space, None)
-    assert alone.prepare(played.spec) == (played.spaces, 1)
-    alone.begin(played.runtime(), played.spec, 3)
+    assert alone.prepare(played.spec.for_actors()) == (played.spaces, 1)
+    alone.begin(played.runtime(), played.spec.for_actors(), 3)
     alone.load(played.snapshot(0))
     for each in (client, alone):
         assert each.collect(IDENTITY) is None

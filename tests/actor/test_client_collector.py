@@ -88,8 +88,8 @@ def drive(client: ClientCollector, robot: Robot, steps: int) -> None:
 def begun(played: Played) -> tuple[ClientCollector, Robot]:
     environment = gymnasium.make(played.spec.environment.id).unwrapped
     client = ClientCollector(environment.observation_space, environment.action_space, None)
-    assert client.prepare(played.spec) == (played.spaces, 1)
-    client.begin(played.runtime(), played.spec, 3)
+    assert client.prepare(played.spec.for_actors()) == (played.spaces, 1)
+    client.begin(played.runtime(), played.spec.for_actors(), 3)
     client.load(played.snapshot(0))
     return client, Robot(environment, environment.reset(seed=1)[0])
 
@@ -107,7 +107,7 @@ def test_client_rollouts_equal_those_of_an_environment_collector(environment: di
     )
     # Each collector samples from one generator: give the client the seed that the other derives for its actions.
     _, *action_seed = np.random.SeedSequence(3).generate_state(4).astype("<u4")
-    client.begin(played.runtime(), played.spec, int.from_bytes(np.array(action_seed).tobytes(), "little"))
+    client.begin(played.runtime(), played.spec.for_actors(), int.from_bytes(np.array(action_seed).tobytes(), "little"))
     client.load(played.snapshot(0))
     found: list[Rollout] = []
     for version in range(8):
@@ -136,7 +136,7 @@ def test_new_policy_acts_from_the_first_step_after_its_weights_came() -> None:
     played = Played(run_spec())
     client, robot = begun(played)
     drive(client, robot, 3)
-    client.begin(played.runtime(), played.spec, 4)
+    client.begin(played.runtime(), played.spec.for_actors(), 4)
     drive(client, robot, 40)  # before its weights came, the previous policy acts, and its rollouts are discarded
     assert not client.has_rollout()
     client.load(played.snapshot(7))
@@ -154,7 +154,7 @@ def test_agent_acts_on_when_another_learner_is_joined_while_it_changes_to_the_po
     def join_another(rows: ClientRows, *arguments: Any) -> None:
         """Stand for the service's thread, which may do this at any moment."""
         monkeypatch.setattr(ClientRows, "observe", observe)
-        client.begin(played.runtime(), played.spec, 4)
+        client.begin(played.runtime(), played.spec.for_actors(), 4)
         rows.observe(*arguments)
 
     monkeypatch.setattr(ClientRows, "observe", join_another)
@@ -168,7 +168,7 @@ def test_agent_acts_on_when_another_learner_is_joined_while_it_changes_to_the_po
 def test_first_action_is_of_a_policy_that_came_although_another_learner_is_joined() -> None:
     played = Played(run_spec())
     client, robot = begun(played)
-    client.begin(played.runtime(), played.spec, 4)
+    client.begin(played.runtime(), played.spec.for_actors(), 4)
     drive(client, robot, 40)
     assert not client.has_rollout()
     client.load(played.snapshot(2))
@@ -278,8 +278,8 @@ def guarded(played: Played, **settings: Any) -> tuple[ClientCollector, Robot]:
     space = environment.action_space
     guard = PolicyGuard(space, 1, settings.get("max_policy_age"), untrained=settings.get("untrained", False))
     client = ClientCollector(environment.observation_space, space, None, guard)
-    client.prepare(played.spec)
-    client.begin(played.runtime(), played.spec, 3)
+    client.prepare(played.spec.for_actors())
+    client.begin(played.runtime(), played.spec.for_actors(), 3)
     client.load(played.snapshot(settings.get("version", 1)))
     client.confirm(time.monotonic())
     return client, Robot(environment, environment.reset(seed=1)[0])
@@ -314,7 +314,7 @@ def test_another_learner_with_an_untrained_policy_does_not_drive() -> None:
     played = Played(run_spec())
     client, robot = guarded(played, version=500)
     drive(client, robot, 3)
-    client.begin(played.runtime(), played.spec, 4)
+    client.begin(played.runtime(), played.spec.for_actors(), 4)
     client.load(played.snapshot(0))
     assert [client.agents[0].act(robot.observation) for _ in range(20)] == [1] * 20
     client.load(played.snapshot(1))
@@ -400,4 +400,4 @@ def test_run_whose_settings_only_an_environment_of_ours_applies_is_refused(setti
     changed = spec.model_copy(update={"environment": spec.environment.model_copy(update={setting: value})})
     client = ClientCollector(environment.observation_space, environment.action_space, None)
     with pytest.raises(ActorError, match=rf"environment\.{setting}={value}"):
-        client.prepare(changed)
+        client.prepare(changed.for_actors())

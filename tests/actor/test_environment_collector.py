@@ -348,12 +348,12 @@ def test_environments_are_made_anew_for_another_specification_only() -> None:
     run = RunSpec(environment=COUNTING)
     collector = EnvironmentCollector()
     with mock.patch.object(environment_collector, "make_environments", make):
-        assert collector.prepare(run) == (Seeds.spaces, 1)
-        collector.prepare(run.model_copy(update={"collection": CollectionSpec(rollout_length=7)}))
+        assert collector.prepare(run.for_actors()) == (Seeds.spaces, 1)
+        collector.prepare(run.model_copy(update={"collection": CollectionSpec(rollout_length=7)}).for_actors())
         assert [each.closed for each in made] == [False]
-        collector.prepare(RunSpec(environment=STACKED))
+        collector.prepare(RunSpec(environment=STACKED).for_actors())
         assert [each.closed for each in made] == [True, False]
-        collector.prepare(RunSpec(environment=STACKED))
+        collector.prepare(RunSpec(environment=STACKED).for_actors())
         assert [each.closed for each in made] == [True, False]
     collector.close()
     assert [each.closed for each in made] == [True, True]
@@ -366,7 +366,7 @@ def test_environments_are_made_anew_for_another_number_of_them(own_count: int | 
     counts = []
     for count in (2, 4, 4):
         run = RunSpec(environment=COUNTING, collection=CollectionSpec(envs_per_actor=count))
-        counts.append(collector.prepare(run)[1])
+        counts.append(collector.prepare(run.for_actors())[1])
     collector.close()
     assert counts == ([2, 4, 4] if own_count is None else [3] * 3)
 
@@ -375,7 +375,7 @@ def test_environments_are_kept_if_the_backend_makes_fewer_than_requested() -> No
     run = RunSpec(environment=COUNTING, collection=CollectionSpec(envs_per_actor=8))
     collector = EnvironmentCollector()
     with mock.patch.object(environment_collector, "make_environments", side_effect=lambda *_, **__: Seeds()) as make:
-        assert [collector.prepare(run)[1] for _ in range(2)] == [1, 1]
+        assert [collector.prepare(run.for_actors())[1] for _ in range(2)] == [1, 1]
     assert make.call_count == 1
 
 

@@ -71,8 +71,8 @@ def test_actor_that_owns_no_loop() -> None:
     policy = learner_of(MemoryNetwork()).policy
     environment = gymnasium.make("CartPole-v1")
     client = ClientCollector(environment.observation_space, environment.action_space, None)
-    client.prepare(SPEC)
-    client.begin(OnnxRuntime(policy.model), SPEC, 3, EPSILON)
+    client.prepare(SPEC.for_actors())
+    client.begin(OnnxRuntime(policy.model), SPEC.for_actors(), 3, EPSILON)
     weights = {name: parameter.detach().numpy() for name, parameter in policy.network.named_parameters()}
     client.load(Snapshot(learner_epoch=1, policy_version=0, program="", weights=weights))
     random = np.random.default_rng(1)

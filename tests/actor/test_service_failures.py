@@ -174,7 +174,7 @@ def test_actor_ends_with_the_reason_when_its_certificate_is_refused(
 def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     for run in ("one", "two"):
         transport = MemoryTransport(network)
-        welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC))
+        welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC.for_actors()))
         transport.serve(keys.join(run, "*"), lambda request, welcome=welcome: request.reply(welcome))
     actor = RunningActor(network)
     actor.join()

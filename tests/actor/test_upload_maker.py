@@ -83,7 +83,7 @@ spaces = Spaces.model_validate({
 for upload in ("rollouts", "gradients"):
     spec = {"environment": {"id": "A-v0"}, "training": {"algorithm": "a3c"}, "collection": {"upload": upload}}
     try:
-        print(type(make_upload_maker(RunSpec.model_validate(spec), spaces, NO_MODULES)).__name__)
+        print(type(make_upload_maker(RunSpec.model_validate(spec).for_actors(), spaces, NO_MODULES)).__name__)
     except ActorError as error:
         print(error)
 """
@@ -106,16 +106,18 @@ def test_an_actor_imports_modules_for_gradients_only_if_its_command_line_allows_
     spec: RunSpec, reason: str
 ) -> None:
     with pytest.raises(ActorError, match=reason):
-        make_upload_maker(spec, SPACES, UserModules(frozenset({"other"}), "the learner"))
+        make_upload_maker(spec.for_actors(), SPACES, UserModules(frozenset({"other"}), "the learner"))
     rollouts = spec.model_copy(update={"collection": spec.collection.model_copy(update={"upload": "rollouts"})})
-    assert isinstance(make_upload_maker(rollouts, SPACES, NO_MODULES), RolloutUploadMaker)
+    assert isinstance(make_upload_maker(rollouts.for_actors(), SPACES, NO_MODULES), RolloutUploadMaker)
     assert rollouts.actor_modules == {}
     assert spec.actor_modules == spec.learner_modules
 
 
 def test_a_network_that_cannot_be_constructed_is_reported_in_one_line() -> None:
     with pytest.raises(ActorError, match="absent_module"):
-        make_upload_maker(spec_of(encoder="absent_module:Net"), SPACES, UserModules(frozenset({"absent_module"})))
+        make_upload_maker(
+            spec_of(encoder="absent_module:Net").for_actors(), SPACES, UserModules(frozenset({"absent_module"}))
+        )
 
 
 def test_a_client_refuses_a_run_that_takes_gradients() -> None:
@@ -123,7 +125,7 @@ def test_a_client_refuses_a_run_that_takes_gradients() -> None:
 
     client = ClientCollector(Box(-1.0, 1.0, (4,), np.float32), Discrete(2), None)
     with pytest.raises(ActorError, match="this run takes gradients"):
-        client.prepare(spec_of())
+        client.prepare(spec_of().for_actors())
 
 
 @pytest.mark.parametrize(("algorithm", "kind"), [("impala", "corrects"), ("appo", "makes several updates")])

@@ -254,7 +254,7 @@ def test_gradients_of_actors_make_the_updates_of_the_rollouts_to_the_bit(algorit
         }
     )
     by_rollouts, by_gradients = (Learner(spec.training, spec.policy, SPACES) for _ in range(2))
-    actor = RolloutGradients(spec, SPACES)
+    actor = RolloutGradients(spec.learning, SPACES)
     actor._in_float32 = True
     for turn in range(5):
         rollout = make_rollout(seed=turn, state_size=by_rollouts.state_size)

@@ -235,7 +235,7 @@ def test_actors_that_compute_gradients_have_the_statistics_of_the_learner(module
     collection = spec.collection.model_copy(update={"upload": "gradients"})
     spec = RunSpec.model_validate({**spec.model_dump(), "collection": collection.model_dump()})
     by_rollouts, by_gradients = (Learner(spec.training, POLICY, SPACES, modules) for _ in range(2))
-    actor = RolloutGradients(spec, SPACES, modules)
+    actor = RolloutGradients(spec.learning, SPACES, modules)
     for sequence in range(4):
         inputs = float32(bfloat16(by_gradients.gradient_inputs(0.0)))
         actor.load({name: values.copy() for name, values in by_gradients.weights().items()} | inputs)

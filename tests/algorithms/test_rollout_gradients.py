@@ -71,7 +71,7 @@ def test_rollout_of_which_an_own_algorithm_makes_no_update_has_a_gradient_of_0()
     name, modules = f"{__name__}:NothingWithoutRows", UserModules(frozenset({__name__}))
     spec = spec_of(name, algorithm_record=NothingWithoutRows.record.model_dump())
     learner = Learner(spec.training, spec.policy, SPACES, modules)
-    gradients = RolloutGradients(spec, SPACES, modules)
+    gradients = RolloutGradients(spec.learning, SPACES, modules)
     gradients.load(snapshot(learner))
     rollout = played("a", 0)
     assert any(values.any() for values in sent(gradients, rollout).gradient.values())
@@ -88,7 +88,7 @@ def test_gradients_of_single_rollouts_make_the_updates_of_the_rollouts_to_the_bi
     """Two actors take turns: each needs the statistics of the returns of both, which snapshots bring."""
     spec = spec_of(memory=memory, optimizer=optimizer, exploration=(epsilon,), **NORMALISED, **ANNEALED)
     by_rollouts, by_gradients = learner_of(spec), learner_of(spec)
-    actors = {name: RolloutGradients(spec, SPACES) for name in "ab"}
+    actors = {name: RolloutGradients(spec.learning, SPACES) for name in "ab"}
     for turn in range(4):
         name, progress = "ab"[turn % 2], turn / 4
         actor, rollout = actors[name], played(name, turn // 2, by_rollouts.state_size)
@@ -109,7 +109,7 @@ def test_the_mean_of_gradients_is_the_gradient_of_the_batch() -> None:
     """Each valid row counts once, however many its rollout has; the statistics are those of all rows."""
     spec = spec_of(normalize_rewards=True)
     by_rollouts, by_gradients = learner_of(spec), learner_of(spec)
-    actors = {name: RolloutGradients(spec, SPACES) for name in "ab"}
+    actors = {name: RolloutGradients(spec.learning, SPACES) for name in "ab"}
     rollouts = [played("a", 0), played("b", 0)]
     assert rollouts[0].env_steps != rollouts[1].env_steps
     by_rollouts.step(rollouts, 0.0)
@@ -130,7 +130,7 @@ def test_the_mean_of_gradients_is_the_gradient_of_the_batch() -> None:
 def test_statistics_of_several_actors_are_those_of_all_their_rows() -> None:
     spec = spec_of(normalize_rewards=True)
     by_rollouts, by_gradients = learner_of(spec), learner_of(spec)
-    actors = {name: RolloutGradients(spec, SPACES) for name in "abc"}
+    actors = {name: RolloutGradients(spec.learning, SPACES) for name in "abc"}
     for sequence in range(3):
         rollouts = [played(name, sequence) for name in actors]
         gradients = []
@@ -146,8 +146,8 @@ def test_statistics_of_several_actors_are_those_of_all_their_rows() -> None:
 
 def test_what_rounding_loses_is_sent_with_later_gradients() -> None:
     spec = spec_of("a3c")
-    learner, compact = learner_of(spec), RolloutGradients(spec, SPACES)
-    exact = RolloutGradients(spec_of("a2c"), SPACES)
+    learner, compact = learner_of(spec), RolloutGradients(spec.learning, SPACES)
+    exact = RolloutGradients(spec_of("a2c").learning, SPACES)
     wanted: dict[str, np.ndarray] = {}
     received: dict[str, np.ndarray] = {}
     once: dict[str, np.ndarray] = {}
@@ -171,7 +171,7 @@ def test_what_rounding_loses_is_sent_with_later_gradients() -> None:
 
 def test_a_gradient_that_is_rejected_does_not_spoil_the_next() -> None:
     spec = spec_of("a3c")
-    actor, learner = RolloutGradients(spec, SPACES), learner_of(spec)
+    actor, learner = RolloutGradients(spec.learning, SPACES), learner_of(spec)
     actor.load(snapshot(learner))
     huge = make_rollout(identity(), rewards=np.full((ROWS, ENVIRONMENTS), 1e30, np.float32))
     spoilt, later = sent(actor, huge), sent(actor, played("a", 1))
@@ -181,7 +181,7 @@ def test_a_gradient_that_is_rejected_does_not_spoil_the_next() -> None:
 
 def test_the_message_holds_what_the_metrics_need() -> None:
     spec = spec_of()
-    actor = RolloutGradients(spec, SPACES)
+    actor = RolloutGradients(spec.learning, SPACES)
     actor.load(snapshot(learner_of(spec)))
     rollout = played("a", 0)
     message = sent(actor, rollout)
@@ -200,7 +200,7 @@ def test_numbers_survive_compact_snapshots_exactly(numbers: tuple[float, float, 
 
 def test_weights_that_do_not_fit_are_refused() -> None:
     spec = spec_of()
-    actor, weights = RolloutGradients(spec, SPACES), snapshot(learner_of(spec))
+    actor, weights = RolloutGradients(spec.learning, SPACES), snapshot(learner_of(spec))
     for wrong, reason in (
         ({name: values for name, values in weights.items() if name != "value_head.bias"}, "lacks the weights 'value_h"),
         (weights | {"value_head.bias": np.zeros(2, np.float32)}, "the network requires"),
@@ -216,7 +216,7 @@ def test_an_actor_recovers_from_a_reward_that_is_not_finite(bad: float) -> None:
     """Without a new snapshot, too: the learner makes none while it rejects every gradient."""
     spec = spec_of(algorithm="a3c", normalize_rewards=True)
     learner = learner_of(spec)
-    actor = RolloutGradients(spec, SPACES)
+    actor = RolloutGradients(spec.learning, SPACES)
     actor.load(snapshot(learner))
     rewards = played("a", 0).rewards.copy()
     rewards[-1, :] = bad
@@ -232,7 +232,7 @@ def test_an_actor_recovers_from_a_reward_that_is_not_finite(bad: float) -> None:
 def test_a_gradient_of_equal_targets_has_no_explained_variance() -> None:
     spec = spec_of(algorithm="a3c", discount_factor=0.0)  # the target of a row is its reward
     by_rollouts, by_gradients = learner_of(spec), learner_of(spec)
-    actor = RolloutGradients(spec, SPACES)
+    actor = RolloutGradients(spec.learning, SPACES)
     actor.load(snapshot(by_gradients))
     rollout = replace(played("a", 0), rewards=np.full_like(played("a", 0).rewards, 0.7))
     gradient = restored(sent(actor, rollout))

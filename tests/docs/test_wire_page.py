@@ -8,8 +8,9 @@ import pytest
 from pages import DOCS
 
 from daedalus.protocol import messages
+from daedalus.protocol.algorithms import ActorDemands
 from daedalus.protocol.codec import PROTOCOL_VERSION
-from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
+from daedalus.protocol.spec import ActorSpec, CollectionSpec, EnvironmentSpec, EvaluatorSpec, LearningSpec
 from daedalus.protocol.status import ActorStatus, Event, EventKind, RunStatus
 
 WIRE = (DOCS / "wire.md").read_text("utf-8")
@@ -69,6 +70,11 @@ def test_the_specifications_tables_have_what_an_actor_needs() -> None:
     environment = first_column(table_under("| `environment.` |")) | {"backend", "processes"}  # named in the row of `id`
     assert environment == set(EnvironmentSpec.model_fields)
     assert first_column(table_under("| `collection.` |")) == set(CollectionSpec.model_fields) - {"actors"}
+    spec = table_under("| `spec.` |")
+    assert first_column(spec) == set(ActorSpec.model_fields)
+    for name, part in (("evaluation", EvaluatorSpec), ("algorithm", ActorDemands), ("learning", LearningSpec)):
+        row = spec.partition(f"| `{name}` |")[2].partition("\n")[0]
+        assert set(part.model_fields) <= set(re.findall(r"`(\w+)`", row))
 
 
 def test_the_page_is_for_this_version() -> None:

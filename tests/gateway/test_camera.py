@@ -50,7 +50,7 @@ def runtime() -> OnnxRuntime:
 
 
 def policy(spec: RunSpec = SPEC, version: int = 4) -> NewestPolicy:
-    welcome = Welcome(run="r", learner_epoch=1, seed=1, epsilon=0.0, spec=spec)
+    welcome = Welcome(run="r", learner_epoch=1, seed=1, epsilon=0.0, spec=spec.for_actors())
     name = program_hash(POLICY.model)
     snapshot = Snapshot(learner_epoch=1, policy_version=version, program=name, weights=weights())
     return NewestPolicy(session=welcome, program=POLICY.model, snapshot=snapshot)
@@ -89,7 +89,7 @@ def test_of_very_many_choices_the_likely_ones_are_shown() -> None:
 
 
 def test_an_episode_is_played_with_pictures() -> None:
-    camera = EpisodeCamera(SPEC, NO_MODULES)
+    camera = EpisodeCamera(SPEC.for_actors(), NO_MODULES)
     try:
         moments = list(camera.play(runtime()))
         again = next(camera.play(runtime()))
@@ -110,7 +110,7 @@ def test_mujoco_is_rendered_without_a_display(monkeypatch: pytest.MonkeyPatch) -
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
     spec = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "InvertedPendulum-v5"})})
-    camera = EpisodeCamera(spec, NO_MODULES)
+    camera = EpisodeCamera(spec.for_actors(), NO_MODULES)
     try:
         policy = Policy.of(spec.policy, camera.spaces)
         acting = OnnxRuntime(policy.model)
@@ -130,7 +130,7 @@ def test_large_pictures_are_made_smaller() -> None:
 def test_module_that_is_not_allowed_is_not_imported() -> None:
     spec = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "evil:Evil-v0"})})
     with pytest.raises(EnvironmentSetupError, match="may not be imported here"):
-        EpisodeCamera(spec, NO_MODULES)
+        EpisodeCamera(spec.for_actors(), NO_MODULES)
 
 
 def facts_of(frame: bytes) -> dict[str, Any]:

@@ -316,7 +316,7 @@ def test_image_that_is_too_large_for_the_transforms_is_refused_at_once(shape: li
     tracemalloc.start()
     try:
         with pytest.raises(ClientError, match=r"observation is an image .* at most 8,192 pixels a side"):
-            actor.prepare(run_spec(resize=(84, 84)))
+            actor.prepare(run_spec(resize=(84, 84)).for_actors())
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
@@ -330,7 +330,7 @@ def test_images_of_a_camera_are_not_too_large() -> None:
     }
     spaces = ClientSpaces(stated, {"action": {"kind": "discrete", "counts": [2]}})
     actor = ClientActor(Join(actor="a", incarnation=1), spaces, None)  # type: ignore[arg-type] - it sends nothing
-    join, _ = actor.prepare(run_spec(crop=(0, 0, 4, 4), grey=True, resize=(84, 84), leave_out=("unseen",)))
+    join, _ = actor.prepare(run_spec(crop=(0, 0, 4, 4), grey=True, resize=(84, 84), leave_out=("unseen",)).for_actors())
     assert join.spaces is not None
     assert {name: space.shape for name, space in join.spaces.observations.items()} == {
         "camera": (84, 84),

@@ -34,7 +34,7 @@ LEARNER = Learner(SPEC.training, SPEC.policy, SPACES)
 
 
 def gradient(sequence: int = 0, version: int = VERSION, spec: RunSpec = SPEC, **replaced: Any) -> Gradient:
-    actor = RolloutGradients(spec, SPACES)
+    actor = RolloutGradients(spec.learning, SPACES)
     actor.load(LEARNER.weights() | LEARNER.gradient_inputs(0.0))
     computed = actor.compute(make_rollout(identity(sequence=sequence), version=version, seed=sequence))
     return replace(computed, **replaced)
@@ -150,7 +150,7 @@ def test_the_largest_observations_that_rollouts_may_have_are_accepted() -> None:
     frames[::2] *= -1.0
     rollout = make_rollout(version=VERSION, frames=frames)
     assert first_component_violation(rollout, SPACES) == ""
-    actor = RolloutGradients(SPEC, SPACES)
+    actor = RolloutGradients(SPEC.learning, SPACES)
     actor.load(LEARNER.weights() | LEARNER.gradient_inputs(0.0))
     computed = replace(actor.compute(rollout), gradient=GOOD.gradient)
     assert float(computed.moments["observations/observation"].max()) > LARGEST_OBSERVATION**2

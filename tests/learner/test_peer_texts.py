@@ -51,7 +51,7 @@ def test_the_reason_of_a_quarantine_is_bounded_and_printable() -> None:
 def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
     names = [f"a.{number:02d}".ljust(64, "x") for number in range(PAGE_ACTORS)]
     fleet = Fleet(1, SPACES)
-    responses = QueryResponses("run", run_spec(), EPOCH, 0, fleet, threading.Condition(), EventLog())
+    responses = QueryResponses("run", run_spec().for_actors(), EPOCH, 0, fleet, threading.Condition(), EventLog())
     for name in names:
         join = Join(actor=name, incarnation=1, spaces=SPACES, environments=ENVIRONMENTS, origin=ORIGIN)
         responses.join(name, encode(join), 0.0)
@@ -86,7 +86,9 @@ def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
 @pytest.mark.parametrize("name", ["\x01" * 65_000, FACE * 16_000])
 def test_a_refusal_that_names_a_peer_is_small(name: str) -> None:
     """A name can have the 64 KiB of a key, and as a literal four times as many."""
-    responses = QueryResponses("run", run_spec(), EPOCH, 0, Fleet(1, None), threading.Condition(), EventLog())
+    responses = QueryResponses(
+        "run", run_spec().for_actors(), EPOCH, 0, Fleet(1, None), threading.Condition(), EventLog()
+    )
     for answer in (
         responses.join(name, encode(Join(actor=name, incarnation=1)), 0.0),
         responses.join(name, encode(Join(actor="a", incarnation=1)), 0.0),

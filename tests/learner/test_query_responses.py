@@ -33,7 +33,7 @@ SPEC = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
 
 def make_responses() -> tuple[QueryResponses, Fleet]:
     fleet = Fleet(seed=1, spaces=None)
-    return QueryResponses("run", SPEC, 5, 0, fleet, threading.Condition(), EventLog()), fleet
+    return QueryResponses("run", SPEC.for_actors(), 5, 0, fleet, threading.Condition(), EventLog()), fleet
 
 
 def read(data: bytes) -> Message:
@@ -44,7 +44,7 @@ def test_welcome_contains_run_epoch_specification_and_seed() -> None:
     responses, fleet = make_responses()
     answer = read(responses.join("a", encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(answer, Welcome)
-    assert (answer.run, answer.learner_epoch, answer.spec) == ("run", 5, SPEC)
+    assert (answer.run, answer.learner_epoch, answer.spec) == ("run", 5, SPEC.for_actors())
     assert answer.seed == fleet.seed_for("a", 0)
 
 

@@ -192,8 +192,10 @@ def test_argument_reaches_its_constructor_as_the_value_that_was_written(
     section, name = table.split(".")
     spec = run_spec(settings(f"{table}.x={text}", training={"algorithm": "my_module:Mine"}))
     write_config(tmp_path, spec)
-    welcome = Welcome(run="r", learner_epoch=1, seed=1, spec=spec)
-    for received in (spec, read_config(tmp_path), decode(encode(welcome), LEARNER_LIMITS).spec):  # type: ignore[union-attr]
+    welcome = decode(encode(Welcome(run="r", learner_epoch=1, seed=1, spec=spec.for_actors())), LEARNER_LIMITS)
+    assert isinstance(welcome, Welcome)
+    for_actors = welcome.spec.learning_settings if section == "training" else welcome.spec
+    for received in (spec, read_config(tmp_path), for_actors):
         found = getattr(getattr(received, section), name)["x"]
         assert (type(found), found) == (type(value), value)
 
@@ -286,7 +288,7 @@ def test_setting_that_no_message_to_an_actor_can_hold_is_refused_by_name() -> No
         table = [[float(row), 0.5] for row in range(rows)]
         return run_spec(settings(environment={"id": "X-v0", "action_table": table}))
 
-    welcome = Welcome(run="r" * 64, learner_epoch=2**62, seed=2**32, spec=spec_of(13_000))
+    welcome = Welcome(run="r" * 64, learner_epoch=2**62, seed=2**32, spec=spec_of(13_000).for_actors())
     assert decode(encode(welcome), LEARNER_LIMITS) == welcome
     for rows, size in ((14_000, "266,003"), (65_536, "1,245,189")):
         with pytest.raises(SettingsError) as caught:

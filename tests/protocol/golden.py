@@ -1,7 +1,7 @@
-"""One fixed message of every kind; their bytes are in golden/v{PROTOCOL_VERSION}/.
+"""One fixed message of every kind; their bytes are in golden/v11/, as the first version with such files wrote them.
 
-A change of the wire shows as other bytes. One that is meant raises PROTOCOL_VERSION, and `PYTHONPATH=. python
-tests/protocol/golden.py` writes the bytes of the new version. Those of a tagged release stay; others are deleted.
+Every later release reads them, and may write more fields. `PYTHONPATH=tests/protocol:tests:. python
+tests/protocol/golden.py` writes them again, and adds those of new messages: once a release is tagged, its files stay.
 """
 
 from pathlib import Path
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from daedalus.protocol.client_report import ClientReport
-from daedalus.protocol.codec import PROTOCOL_VERSION, encode
+from daedalus.protocol.codec import FIRST_VERSION, encode
 from daedalus.protocol.compact import bfloat16, planes
 from daedalus.protocol.messages import (
     Acknowledgement,
@@ -137,7 +137,9 @@ MESSAGES: dict[str, Message] = {
         learner_epoch=9,
         seed=3,
         epsilon=0.125,
-        spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}, training_kwargs={"b": 2.5})),
+        spec=RunSpec(
+            environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}, training_kwargs={"b": 2.5})
+        ).for_actors(),
     ),
     "refusal": Refusal(code="mismatch", reason="other spaces"),
     "program": Program(hash="0" * 64, model=np.zeros(400, np.uint8)),
@@ -250,7 +252,7 @@ MESSAGES: dict[str, Message] = {
 }
 
 
-def path(name: str, version: int = PROTOCOL_VERSION) -> Path:
+def path(name: str, version: int = FIRST_VERSION) -> Path:
     """Return the file with the bytes of a message."""
     return FOLDER / f"v{version}" / f"{name}.bin"
 

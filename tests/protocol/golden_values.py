@@ -12,9 +12,9 @@ import numpy as np
 from golden import FOLDER, MESSAGES
 
 from daedalus.protocol import schema
-from daedalus.protocol.codec import PROTOCOL_VERSION
+from daedalus.protocol.codec import FIRST_VERSION
 
-PATH: Path = FOLDER / f"v{PROTOCOL_VERSION}" / "values.json"
+PATH: Path = FOLDER / f"v{FIRST_VERSION}" / "values.json"
 
 
 def values() -> dict[str, Any]:

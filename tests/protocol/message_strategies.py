@@ -286,7 +286,12 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         failure=text,
     ),
     Welcome: st.builds(
-        Welcome, run=text, learner_epoch=counters, seed=counters, epsilon=st.floats(0, 1), spec=run_specs
+        Welcome,
+        run=text,
+        learner_epoch=counters,
+        seed=counters,
+        epsilon=st.floats(0, 1),
+        spec=run_specs.map(RunSpec.for_actors),
     ),
     Refusal: st.builds(Refusal, reason=text),
     Program: st.builds(Program, hash=text, model=st.binary(max_size=300).map(lambda data: np.frombuffer(data, "|u1"))),

@@ -2,14 +2,15 @@
 
 import json
 import typing
+from typing import Any
 
 import golden_values
 import pytest
 import zstandard
 from golden import MESSAGES, path
-from wire_format import PREFIX, the_same
+from wire_format import PREFIX, the_same, unwire, wire
 
-from daedalus.protocol.codec import PROTOCOL_VERSION, VersionMismatchError, decode, encode
+from daedalus.protocol.codec import FIRST_VERSION, PROTOCOL_VERSION, VersionMismatchError, decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Message
 
@@ -27,15 +28,25 @@ def test_every_kind_of_message_has_golden_bytes() -> None:
     assert {type(message) for message in MESSAGES.values()} == set(typing.get_args(Message))
 
 
+def old_part(written: Any, golden: Any) -> Any:
+    """Return what is written without the fields that the golden map does not have: later releases write more."""
+    if not isinstance(written, dict) or not isinstance(golden, dict):
+        return written
+    return {name: old_part(value, golden[name]) for name, value in written.items() if name in golden}
+
+
 @pytest.mark.parametrize("name", MESSAGES)
 def test_bytes_match_the_golden_bytes(name: str) -> None:
-    written = path(name).read_bytes()
-    assert plain(encode(MESSAGES[name])) == plain(written)
-    assert the_same(decode(written, Limits()), MESSAGES[name])
+    stored = path(name).read_bytes()
+    assert the_same(decode(stored, Limits()), MESSAGES[name])
+    golden = plain(stored)
+    flags, content, body = unwire(plain(encode(MESSAGES[name])))
+    content["fields"] = old_part(content["fields"], unwire(golden)[1]["fields"])
+    assert wire(content, body, flags=flags) == golden
 
 
 @pytest.mark.parametrize("name", MESSAGES)
-@pytest.mark.parametrize("version", [PROTOCOL_VERSION - 1, PROTOCOL_VERSION + 1])
+@pytest.mark.parametrize("version", [FIRST_VERSION - 1, PROTOCOL_VERSION + 1])
 def test_bytes_of_other_versions_are_rejected_with_their_version(name: str, version: int) -> None:
     written = path(name).read_bytes()
     other = written[:4] + version.to_bytes(2, "little") + written[6:]
@@ -44,4 +55,5 @@ def test_bytes_of_other_versions_are_rejected_with_their_version(name: str, vers
 
 
 def test_contents_of_the_golden_messages_are_stored_as_json() -> None:
-    assert json.loads(golden_values.PATH.read_text()) == json.loads(json.dumps(golden_values.values()))
+    golden = json.loads(golden_values.PATH.read_text())
+    assert golden == old_part(json.loads(json.dumps(golden_values.values())), golden)

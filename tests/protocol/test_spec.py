@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from daedalus.protocol.algorithms import ALGORITHMS
+from daedalus.protocol.algorithms import ALGORITHMS, ActorDemands
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.protocol.messages import Join
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
+    ActorSpec,
     CollectionSpec,
     EnvironmentSpec,
     EvaluationSpec,
@@ -18,6 +19,7 @@ from daedalus.protocol.spec import (
     RunSpec,
     ServiceSpec,
     TrainingSpec,
+    UnsupportedRunError,
 )
 from daedalus.protocol.specification import Specification
 from daedalus.protocol.status import ActorStatus, RunStatus
@@ -353,3 +355,39 @@ def test_evaluations_play_the_true_task() -> None:
         {"id": "A-v0", "reward_scale": 0.1, "reward_clip": 1.0, **same}
     ).trains_true_task
     assert trained.as_evaluated("envpool") == EnvironmentSpec(id="A-v0", action_repeat=2, backend="envpool")
+
+
+# ------------------------------------------------------------------------------------ what actors receive
+
+
+def test_settings_that_only_the_learner_needs_do_not_travel() -> None:
+    content = {"optimizer": "rmsprop", "learning_rate": 0.25, "env_steps": 77, "device": "cuda", "seed": 5}
+    spec = run(training=content, evaluation={"final_episodes": 3}, service={"queue_megabytes": 2.0}).for_actors()
+    assert spec == run(training={"seed": 5}, service={"queue_megabytes": 2.0}).for_actors()
+    assert (spec.seed, spec.max_upload_bytes) == (5, 2 << 20)
+    assert spec.changed == ("environment.id", "seed", "max_upload_bytes")
+
+
+def test_demands_of_the_algorithm_reach_actors_that_do_not_know_it() -> None:
+    own = {"algorithm": "mine:Own", "algorithm_record": {"synchronous": True, "corrected": True}}
+    assert run(training=own).for_actors().algorithm == ActorDemands(synchronous=True)
+    newer = run(training={"algorithm": "one_step_sarsa"}).for_actors()
+    newer.learning["training"]["algorithm"] = "of_a_newer_release"  # type: ignore[index,call-overload]
+    assert ActorSpec.model_validate(newer.model_dump(mode="json")).algorithm.next_action
+    with pytest.raises(UnsupportedRunError, match=r"the run's training\.algorithm does not fit this release: "):
+        _ = newer.learning_settings
+
+
+def test_setting_of_a_newer_release_is_refused_where_it_is_used_and_the_actor_needs_it() -> None:
+    spec = run(environment={"id": "A-v0", "grey": True}, policy={"hidden": (5,)}).for_actors()
+    assert spec.changed == ("environment.id", "environment.grey", "learning.policy.hidden")
+    spec.check_known()
+    assert spec.learning_settings.policy.hidden == (5,)
+    newer = spec.model_copy(update={"changed": (*spec.changed, "learning.training.newer")})
+    newer.check_known()  # an actor without torch does not need it
+    with pytest.raises(UnsupportedRunError, match=r"sets training\.newer, which this release does not know: upgrade"):
+        _ = newer.learning_settings
+    for path in ("newer", "environment.newer", "environment.grey.newer", "algorithm.newer"):
+        newer = spec.model_copy(update={"changed": (*spec.changed, path)})
+        with pytest.raises(UnsupportedRunError, match=f"sets {path}, which this release does not know: upgrade"):
+            newer.check_known()

@@ -88,7 +88,7 @@ SNAPSHOT = Snapshot(
     program="abc",
     weights={"w": np.array([[1.0, 2.0], [3.0, 4.0]], np.float32), "b": np.array([1, 2, 3], np.uint8)},
 )
-WELCOME = Welcome(run="r", learner_epoch=1, seed=1, spec=RunSpec(environment=EnvironmentSpec(id="x")))
+WELCOME = Welcome(run="r", learner_epoch=1, seed=1, spec=RunSpec(environment=EnvironmentSpec(id="x")).for_actors())
 STATUS = wire(  # every field of a status, as another implementation could write it
     {
         "kind": "StatusReport",

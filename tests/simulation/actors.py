@@ -12,7 +12,7 @@ from daedalus.actor.session.service import ActorService
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 from .kernel import Kernel
@@ -55,11 +55,11 @@ class ScriptedCollector:
         self._actor = actor
         self._snapshot: Snapshot | None = None
 
-    def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
+    def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
         self._actor.pass_time(0.1)
         return _SPACES, 1
 
-    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
+    def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         self._snapshot = None
 
     def load(self, snapshot: Snapshot) -> None:

@@ -15,7 +15,7 @@ from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.spec import LossSpec, PolicySpec
 
 
 class ActionDistribution(nn.Module):
@@ -26,7 +26,7 @@ class ActionDistribution(nn.Module):
     """
 
     def __init__(
-        self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES, training: TrainingSpec | None = None
+        self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES, training: LossSpec | None = None
     ) -> None:
         """Raise NetworkError if a distribution does not support its component, or may not be imported.
 
