@@ -55,11 +55,12 @@ def _gradients() -> tuple[str, int, float]:
             refusal = str(error)
         with closing(HostileActor(here.address, "hostile", environments=_MOST)) as hostile:
             spec = hostile.spec
-            network = ActorCritic(spec.policy, hostile.spaces, training=spec.training)
+            learning = spec.learning_settings
+            network = ActorCritic(learning.policy, hostile.spaces, training=learning.training)
             parameters = {name: each for name, each in network.named_parameters() if each.requires_grad}
             rows = spec.collection.rollout_length * _MOST
-            moments: dict[str, np.ndarray] = {"returns": np.zeros(2)} if spec.training.normalize_rewards else {}
-            if spec.policy.normalize_observations:
+            moments: dict[str, np.ndarray] = {"returns": np.zeros(2)} if learning.training.normalize_rewards else {}
+            if learning.policy.normalize_observations:
                 moments["observations/observation"] = np.zeros((2, 4))
             began = time.monotonic()
             for _ in range(_MESSAGES):
