@@ -117,7 +117,7 @@ def test_mixed_precision_has_the_gradients_of_one_process_in_its_precision() -> 
 
 @pytest.mark.parametrize("algorithm", ["impala", "appo"])
 def test_a_rollout_without_a_finite_gradient_is_left_out_of_all_ranks(algorithm: str) -> None:
-    huge: dict[str, Any] = {"rewards": np.full((ROWS, ENVIRONMENTS), 1e30, np.float32)}
+    huge: dict[str, Any] = {"rewards": np.full((ROWS, ENVIRONMENTS), np.inf, np.float32)}
     rollouts = [make_rollout(identity(actor), seed=ord(actor), **(huge if actor == "b" else {})) for actor in "abc"]
     spec = spec_of(POLICY, **steadily(algorithm=algorithm))
     alone = Learner(spec.training, POLICY, SPACES)
