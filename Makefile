@@ -44,7 +44,7 @@ examples: .venv/ready-test
 screenshots: .venv/ready-test
 	$(BIN)/python -m benchmarks.screenshots
 
-# Attacks on running processes, each with a verdict; about two minutes.
+# Attacks on running processes, each with a verdict; about five minutes.
 attack: .venv/ready-test
 	$(BIN)/python -m benchmarks.attack
 

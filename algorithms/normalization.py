@@ -99,23 +99,26 @@ class ConfirmedRange:
     """The range of the numbers of one component, by the word of more than one rollout and more than one actor.
 
     Running moments weigh every value equally, so that a single rollout of 1e15 would fix them for the rest of a run.
-    Here each rollout is a *vote*: in each number, its mean m, its deviation s and its magnitude (m^2 + s^2)^(1/2). Each
-    actor has its newest 8 votes, and an *owner* (protocol/keys.py) has those of its actors. What all of them show but
-    the largest eighth is confirmed: the largest of 2 to 9 votes, actors or owners does not count. With
+    Here each rollout is a *vote*: in each number, its mean m, its deviation s and its magnitude (m^2 + s^2)^(1/2). An
+    actor has its newest 8 votes, 64 of components with few numbers, and an *owner* (protocol/keys.py) those of its
+    actors. Of the votes of an actor, and of the actors of an owner, the largest one does not count; of the owners the
+    largest eighth, rounded up. What is left is *confirmed*. (One vote, actor or owner alone counts.) With
 
-        c = the median of the actors' median m
+        c = the median of the owners' medians of m
         d = ((m - c)^2 + s^2)^(1/2), of each vote
         R = the confirmed d; max(1, |c|) in a number that was constant
 
-    a vote counts with f = min(1, 10 R / d): n values become f n, and their distances from c are multiplied by f. So a
-    vote adds at most 10 R to a deviation however large it is, and the less, the larger it is. Within 10 R, which means
-    in nearly all of training, nothing is changed. Numbers that grow are followed as soon as they are confirmed, by a
-    second actor, or by the second or third rollout of the only one.
+    a vote counts with f = min(1, 10 R / d): its n values as f n, their distances from c multiplied by f. So its weight
+    falls as its size grows, and nothing adds more than 10 R to a deviation. Within 10 R, which means in nearly all of
+    training, nothing is changed. Numbers that grow are followed as soon as they are confirmed: by a second owner, or by
+    the second rollout of the only actor.
 
-    Moments whose magnitude is above ten times all that the votes show are of a past that nothing confirms, such as a
-    bad first rollout: they are forgotten. And a vote 1e5 times above everything that any *other* actor has ever shown,
-    and above 1, is far outside: it is none, and its rollout has nothing to learn from. A single actor has no others.
-    Unless most of the other owners have shown such a size too, or been far outside with it: then it is rare, and real.
+    Moments ten times above all that an actor has ever shown twice (of more than two owners: that two have shown), or
+    1e5 times above what the present votes confirm, are of a past that nothing confirms, such as a bad first rollout.
+    They are forgotten, unless they are of far more rows than the votes. And a vote 1e5 times above everything that any
+    *other* actor has ever shown, and above 1, is far outside: it is none, and its rollout has nothing to learn from. A
+    single actor has no others. Unless most of the other owners have shown such a size too, or been far outside with it:
+    then it is rare, and real.
 
     The votes are not saved: after a resume, the restored moments stand in for them until an actor has 8 votes or there
     is a second one.

@@ -12,7 +12,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from queue import Empty
@@ -34,7 +34,6 @@ from daedalus.actor.environments.environment_errors import (
 from daedalus.actor.environments.episode_info import info_to_keep
 from daedalus.actor.environments.leaves import leaves
 from daedalus.actor.environments.wrappers import OfItsSpace
-from daedalus.transport.private_address import private_folder
 
 _CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a video
 _TERMINATE_SECONDS = 1.0  # for a process that handles SIGTERM itself
@@ -317,23 +316,11 @@ def _start_method() -> str:
     from multiprocessing import forkserver  # Windows may have none
 
     forkserver.set_forkserver_preload(_PRELOADED)
-    _use_private_folder()
     try:
         forkserver.ensure_running()
     except OSError:  # such as a folder for temporary files whose path is too long for a socket
         return "spawn"
     return "forkserver"
-
-
-def _use_private_folder() -> None:
-    """Let multiprocessing have its sockets in a folder that the next process removes if this one is killed."""
-    configuration = multiprocessing.process.current_process()._config  # type: ignore[attr-defined]
-    if configuration.get("tempdir") is None:
-        stack = ExitStack()
-        with suppress(OSError):
-            configuration["tempdir"] = stack.enter_context(private_folder())
-            # As late as multiprocessing removes its own.
-            multiprocessing.util.Finalize(None, stack.close, exitpriority=-100)
 
 
 @contextmanager

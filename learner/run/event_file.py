@@ -68,13 +68,18 @@ class EventFile:
 
 
 def read_events(directory: Path) -> Iterator[RecordedEvent]:
-    """Yield the events of a run, oldest first. Damaged lines are left out. Raises OSError except for a missing file."""
+    """Yield the events of a run, oldest first. Damaged lines are left out. Raises OSError except for a missing file.
+
+    Launcher and learner write them, each somewhat after its events.
+    """
     try:
         lines = read_regular(directory / EVENTS, 2 * _MAX_BYTES).splitlines()
     except FileNotFoundError:
         return
+    events = []
     for line in lines:
         with suppress(ValueError, KeyError, TypeError, OverflowError, RecursionError):
             fields = json.loads(line)
             texts = {name: without_secrets(str(fields[name])[:_MAX_TEXT]) for name in ("time", "kind", "actor", "text")}
-            yield RecordedEvent(**texts, count=max(int(fields["count"]), 1))
+            events.append(RecordedEvent(**texts, count=max(int(fields["count"]), 1)))
+    yield from sorted(events, key=lambda event: event.time)

@@ -74,7 +74,7 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
     assert json.loads(line)["actors_alive"] == 2
     again = start(*learner, "one/sb", *often)  # as by a supervisor
     assert again.wait() == 7
-    again.expect(r"one/sb: a newer learner of this run \(epoch [0-9a-f]+\) took over: .* remove one/sb/summary.json")
+    again.expect(r"one/sb: a newer learner of this run \(epoch [0-9a-f]+\) took over: .* remove \S*one/sb/summary.json")
 
 
 def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release(
