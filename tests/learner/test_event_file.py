@@ -10,16 +10,16 @@ from daedalus.learner.run.event_file import EventFile, read_events
 from daedalus.protocol.status import Event
 
 
-def event(text: str = "left", count: int = 1) -> Event:
-    return Event(time="2026-11-22T10:15:00.250Z", kind="left", actor="arm", text=text, count=count)
+def event(text: str = "left", count: int = 1, time: str = "2026-11-22T10:15:00.250Z") -> Event:
+    return Event(time=time, kind="left", actor="arm", text=text, count=count)
 
 
 def test_events_of_several_processes_are_kept_in_order(tmp_path: Path) -> None:
     assert list(read_events(tmp_path)) == []
     learner, launcher = EventFile(tmp_path), EventFile(tmp_path)
-    learner.add([event("first"), event("second", 7)])
     launcher.add_restart("the learner was killed by signal 9; started again")
-    EventFile(tmp_path).add([event("third")])
+    learner.add([event("first"), event("second", 7)])  # written later than the restart, and earlier in time
+    EventFile(tmp_path).add([event("third", time="2999-11-22T10:15:00.250Z")])
     found = [(each.kind, each.actor, each.text, each.count) for each in read_events(tmp_path)]
     assert found == [
         ("left", "arm", "first", 1),
