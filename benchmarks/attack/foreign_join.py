@@ -36,7 +36,9 @@ def foreign_join() -> Verdict:
             refused = 0
             for spaces in _FOREIGN:
                 join = encode(Join(actor="stranger", incarnation=1, spaces=spaces, environments=1))
-                answers = stranger.query(keys.join("run", "stranger"), join, timeout=_TIMEOUT)
+                answers: list[bytes] = []
+                while not answers:  # the learner may serve its status before it serves joins
+                    answers = list(stranger.query(keys.join("run", "stranger"), join, timeout=_TIMEOUT))
                 refused += sum(isinstance(decode(answer, LEARNER_LIMITS), Refusal) for answer in answers)
             here.start("actor", "--connect", here.address, "--name", "honest")
             here.wait_for_training("honest")

@@ -55,7 +55,7 @@ class _Attack:
             folder = ["certs"] if words[0] == "init" else ["--directory", "certs"]
             here.start("certs", *words, *folder).wait()
         certificates = here.folder / "certs"
-        self._tls = ssl.create_default_context(cafile=certificates / "ca" / "ca.pem")
+        self._tls = ssl.create_default_context(cafile=certificates / "gateway" / "ca.pem")
         self._tokens = {
             name: (certificates / path / "token").read_text().strip()
             for name, path in (("phone", "client-phone"), ("arm", "client-arm"), ("operator", "operator"))
