@@ -42,25 +42,16 @@ with private_folder() as folder:
     print(folder, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
-WITH_ENVIRONMENTS = """
-import os, signal
-from gymnasium.envs.classic_control import CartPoleEnv
-from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-EnvironmentProcesses("CartPole-v1", [CartPoleEnv])
-print("made", flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
 
 
-@pytest.mark.parametrize("program", [KILLED, WITH_ENVIRONMENTS])
 def test_folders_of_killed_processes_are_removed_by_the_next_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with private_address() as address:
         alive = path_of(address).parent
-        subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+        subprocess.run([sys.executable, "-c", KILLED], capture_output=True, check=False)
         (dead,) = (entry for entry in tmp_path.iterdir() if entry != alive)
         assert dead.name.startswith("daedalus-")
         home, theirs, unknown = tmp_path / "home", tmp_path / "daedalus-link", tmp_path / "daedalus-unknown"
