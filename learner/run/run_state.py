@@ -46,7 +46,7 @@ class RunState:
         self.directory, self.name, self.spec, self._started = directory, run_name(directory), spec, started
         self._starts = starts_before + 1
         self.learner_epoch = new_epoch(self._starts)
-        self.other_episodes = False  # than before a resume, so that returns and scores of then say nothing now
+        self.other_episodes = False  # episodes have another limit since a resume: earlier returns do not compare
         self.counters = RunCounters(spec.training.target_episodes)
         self.annealing = Annealing(budget=spec.training.env_steps)
         self.evaluations = Evaluations(self.learner_epoch, self.counters)
