@@ -20,7 +20,7 @@ def run(*words: str | Path, folder: Path) -> str:
 
 
 def build(kind: str, tree: Path, target: Path) -> Path:
-    """Build the `sdist` or the `wheel` of a source tree, without network; return the file in the new folder `target`."""
+    """Build the `sdist` or the `wheel` of a source tree, without network; return it in a new folder `target`."""
     target.mkdir()
     run(sys.executable, "-c", _BUILD, f"build_{kind}", target, folder=tree)
     (built,) = target.iterdir()
