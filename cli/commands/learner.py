@@ -70,12 +70,13 @@ from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_words, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.credentials import Credentials, CredentialsError
-from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.security import (
+from daedalus.transport.credentials import (
     SECURITY_ERRORS,
+    Credentials,
+    CredentialsError,
     certificate_days_left,
 )
+from daedalus.transport.interface import Transport, TransportError
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
