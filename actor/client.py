@@ -31,10 +31,9 @@ from daedalus.actor.session.config import ActorConfig, LinkChoice
 from daedalus.actor.session.own_name import own_name
 from daedalus.actor.session.service import ActorService
 from daedalus.protocol import keys
-from daedalus.protocol.client_report import ClientReport
-from daedalus.protocol.messages import MAX_ENVIRONMENTS
+from daedalus.protocol.messages import MAX_ENVIRONMENTS, ClientReport
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.security import credentials_to_connect
+from daedalus.transport.credentials import credentials_to_connect
 
 _REFUSAL_SECONDS = 12.0  # after `timeout`, for the last two queries of the client's thread, if nobody answers them
 _numbers = itertools.count(1)  # of the clients of this process

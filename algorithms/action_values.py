@@ -10,7 +10,7 @@ from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.losses import shares_of
 from daedalus.algorithms.returns import lambda_returns
-from daedalus.policy.network.distributions.categorical import without_illegal
+from daedalus.policy.network.distributions import without_illegal
 
 
 class ActionValues(Algorithm):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.components import Components
+from daedalus.policy.network.layers import Components
 
 
 class Forward:

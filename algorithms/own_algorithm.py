@@ -8,8 +8,8 @@ import torch
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.errors import AlgorithmError
-from daedalus.policy.network.components import map_components
-from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.network.action_distribution import ActionDistribution
+from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.algorithms import AlgorithmRecord

@@ -9,7 +9,7 @@ from daedalus.algorithms.n_step_q import NStepQ
 from daedalus.algorithms.one_step_q import OneStepQ
 from daedalus.algorithms.one_step_sarsa import OneStepSarsa
 from daedalus.algorithms.own_algorithm import own_algorithm
-from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.network.action_distribution import ActionDistribution
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.algorithms import is_own
 from daedalus.protocol.spec import LossSpec

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.protocol import codec
-from daedalus.transport import zenoh_messages, zenoh_transport
+from daedalus.transport import zenoh_declarations, zenoh_transport
 
 SPENT: dict[str, float] = defaultdict(float)
 ACTIVE = threading.local()
@@ -64,8 +64,8 @@ def main() -> None:
         setattr(codec, name, timed("codec", getattr(codec, name)))
     for owner, names in (
         (zenoh_transport.ZenohTransport, ("query_async", "publish", "query")),
-        (zenoh_messages.ZenohRequest, ("reply",)),
-        (zenoh_messages.ZenohInbox, ("take",)),
+        (zenoh_declarations.ZenohRequest, ("reply",)),
+        (zenoh_declarations.ZenohInbox, ("take",)),
     ):
         for name in names:
             setattr(owner, name, timed("transport", getattr(owner, name)))

@@ -25,8 +25,7 @@ from daedalus.learner.run.settings import read_preset, run_spec
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Snapshot, SnapshotPart, SnapshotRequest
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import RunStatus, Snapshot, SnapshotPart, SnapshotRequest
 from daedalus.transport.interface import Transport
 from daedalus.transport.zenoh_transport import connect
 

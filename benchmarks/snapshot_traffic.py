@@ -17,7 +17,7 @@ from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
 from benchmarks.slow_actors import MODULE, provide_environment
 from daedalus.actor.session.config import LinkChoice
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import RunStatus
 
 _UNLIMITED = 1e12  # bytes per second
 

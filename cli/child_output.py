@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Self
 
 from daedalus.policy.saving.regular_files import append_own
-from daedalus.protocol.redaction import without_secrets
+from daedalus.protocol.texts import without_secrets
 
 STREAMS = ("stdout", "stderr")
 

@@ -27,7 +27,7 @@ from daedalus.gateway.watching.observation import Observation
 from daedalus.gateway.watching.page_data import PageData
 from daedalus.gateway.watching.source import OtherRun
 from daedalus.protocol.codec import ProtocolError
-from daedalus.protocol.orders import Order
+from daedalus.protocol.messages import Order
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError

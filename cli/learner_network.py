@@ -8,11 +8,10 @@ from daedalus.cli.settings_arguments import LISTEN, ChosenRun
 from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.policy.user_modules import allow_settings, shown_path
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.addresses import reachable
 from daedalus.transport.connecting import connect_with_retry, listen
-from daedalus.transport.credentials import Credentials
+from daedalus.transport.credentials import Credentials, credentials_to_connect, credentials_to_listen
 from daedalus.transport.interface import Transport
-from daedalus.transport.reachable import reachable
-from daedalus.transport.security import credentials_to_connect, credentials_to_listen
 
 _logger = logging.getLogger(__name__)
 

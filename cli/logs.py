@@ -9,8 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import TextIO
 
 from daedalus.protocol import keys
-from daedalus.protocol.texts import printable
-from daedalus.protocol.timestamps import utc
+from daedalus.protocol.texts import printable, utc
 
 EVENTS = "daedalus.learner.serving.events"  # logger of the events of a run
 LEVELS = ("debug", "info", "warning", "error")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from daedalus.cli.status_query import newest_of_each_run
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.messages import ActorStatus, RunStatus
 
 _Family = type[CounterMetricFamily] | type[GaugeMetricFamily]
 

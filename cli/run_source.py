@@ -6,10 +6,16 @@ from daedalus.cli.status_query import ask, ask_events, decoded, newest_of_each_r
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, METRICS_LIMITS
-from daedalus.protocol.messages import Acknowledgement, Refusal
-from daedalus.protocol.metrics import MetricsReport, MetricsRequest
-from daedalus.protocol.orders import Order, OrderRequest
-from daedalus.protocol.status import EventsPage, RunStatus
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    EventsPage,
+    MetricsReport,
+    MetricsRequest,
+    Order,
+    OrderRequest,
+    Refusal,
+    RunStatus,
+)
 from daedalus.transport.interface import Transport
 
 _ANSWER_SECONDS = 5.0

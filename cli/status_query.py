@@ -9,8 +9,16 @@ from typing import TypeVar
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, Limits
-from daedalus.protocol.messages import ActorsReport, ActorsRequest, EventsReport, EventsRequest, StatusReport
-from daedalus.protocol.status import ActorStatus, EventsPage, RunStatus
+from daedalus.protocol.messages import (
+    ActorsReport,
+    ActorsRequest,
+    ActorStatus,
+    EventsPage,
+    EventsReport,
+    EventsRequest,
+    RunStatus,
+    StatusReport,
+)
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)

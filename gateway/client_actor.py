@@ -19,7 +19,7 @@ from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.messages import Act, EndEpisode
 from daedalus.gateway.policy_versions import PolicyVersion
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.spec import ActorSpec

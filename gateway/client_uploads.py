@@ -6,9 +6,8 @@ from dataclasses import replace
 
 from daedalus.actor.session.client_reports import ClientReports
 from daedalus.actor.session.upload_session import UploadSession
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Join, Welcome
+from daedalus.protocol.messages import ClientReport, Join, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import QuerySender
 

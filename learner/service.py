@@ -31,9 +31,9 @@ from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules, shown_path
+from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:

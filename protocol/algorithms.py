@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from daedalus.protocol.specification import PositiveInt, Specification, UnitInterval
+from daedalus.protocol.models import PositiveInt, Specification, UnitInterval
 
 Heads = Literal["policy_and_value", "action_values"]
 Epsilons = Annotated[tuple[UnitInterval, ...], Field(min_length=1, max_length=64)]

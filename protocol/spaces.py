@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import FailFast, Field, StringConstraints, field_validator, model_validator
 
-from daedalus.protocol.specification import PositiveInt, Specification
+from daedalus.protocol.models import PositiveInt, Specification
 
 LARGEST_OBSERVATION = 1e15  # of a number in an observation: beyond it squares overflow float32
 LARGEST_REWARD = 1e9  # as learning sees it: the learner (learner/serving/rollout_judge.py) rejects larger ones

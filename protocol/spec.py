@@ -15,8 +15,7 @@ from pydantic import AfterValidator, Field, JsonValue, ValidationError, model_va
 
 from daedalus.protocol.algorithms import ALGORITHMS, ActorDemands, AlgorithmRecord, Epsilons, check_algorithm, is_own
 from daedalus.protocol.limits import LEARNER_LIMITS
-from daedalus.protocol.spaces import ComponentName
-from daedalus.protocol.specification import (
+from daedalus.protocol.models import (
     NaturalInt,
     PositiveInt,
     Specification,
@@ -24,6 +23,7 @@ from daedalus.protocol.specification import (
     changed_fields,
     has_field,
 )
+from daedalus.protocol.spaces import ComponentName
 from daedalus.protocol.texts import bounded_text
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]

@@ -16,11 +16,11 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ClientReport,
     Join,
     Message,
     Program,

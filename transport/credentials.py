@@ -14,12 +14,15 @@ import functools
 import logging
 import os
 import ssl
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from daedalus.transport.access_control import access_control
+from daedalus.transport.addresses import AddressError, check_connecting, check_listening
 
 CA, CERTIFICATE, KEY, CLIENTS = "ca.pem", "certificate.pem", "key.pem", "clients.pem"
 WARNING_DAYS = 30  # before a certificate expires
@@ -219,3 +222,90 @@ def _handshake(client: ssl.SSLContext, server: ssl.SSLContext) -> dict[str, Any]
             with contextlib.suppress(ssl.SSLWantReadError):
                 end.do_handshake()
     return dict(ends[1].getpeercert() or {})
+
+
+_POLL_SECONDS = 1.0
+
+
+_Stamp = tuple[tuple[int, int, int] | None, ...]  # inode, time of change and size of each file; None if it is missing
+
+
+class CredentialsWatch:
+    """Watch of one folder, from `open` to `close`. Has its own thread."""
+
+    def __init__(self, credentials: Credentials, on_change: Callable[[], None]) -> None:
+        """Construct the watch.
+
+        Args:
+          credentials: the folder, and the role that its certificate must have.
+          on_change: called when the files have changed and are valid.
+        """
+        self._credentials, self._on_change = credentials, on_change
+        self._used = self._seen = self._stamp()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="credentials watch", daemon=True)
+
+    def open(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the thread. Does not wait for a change that is being applied."""
+        self._closed.set()
+
+    def _watch(self) -> None:
+        while not self._closed.wait(_POLL_SECONDS):
+            stamp = self._stamp()
+            # Files that are still being copied differ from poll to poll.
+            if stamp == self._seen and stamp != self._used:
+                self._used = stamp
+                self._apply()
+            self._seen = stamp
+
+    def _apply(self) -> None:
+        folder = self._credentials.directory
+        try:
+            load(folder, self._credentials.role)
+            names = authorised_names(folder)
+        except CredentialsError as error:
+            _logger.warning("the changed certificates are not used: %s", error)
+            return
+        self._on_change()
+        _logger.info(
+            "certificates in %s have changed: %d actors and %d operators are authorised; all connections are renewed",
+            folder,
+            len(names["actors"]),
+            len(names["operators"]),
+        )
+
+    def _stamp(self) -> _Stamp:
+        return tuple(map(self._stamp_of, (CA, CERTIFICATE, KEY, CLIENTS)))
+
+    def _stamp_of(self, name: str) -> tuple[int, int, int] | None:
+        try:
+            found = (self._credentials.directory / name).stat()
+        except OSError:
+            return None
+        return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+SECURITY_ERRORS = (AddressError, CredentialsError)
+
+
+def credentials_to_listen(endpoints: list[str], tls: Path | None, role: str, *, insecure: bool) -> Credentials | None:
+    """Return the certificate to listen with, or None without `tls`. Raises one of SECURITY_ERRORS."""
+    check_listening(endpoints, tls=tls is not None, insecure=insecure)
+    return None if tls is None else load(tls, role)
+
+
+def credentials_to_connect(endpoints: list[str], tls: str | Path | None, *roles: str) -> Credentials | None:
+    """Return the certificate to connect with, or None without `tls`. Raises one of SECURITY_ERRORS."""
+    check_connecting(endpoints, tls=tls is not None)
+    return None if tls is None else load(Path(tls), *roles)
+
+
+def certificate_days_left(credentials: Credentials | None) -> float | None:
+    """Return the days until a certificate expires, or None without one, or while it is being replaced."""
+    with contextlib.suppress(CredentialsError):
+        return None if credentials is None else credentials.days_left()
+    return None

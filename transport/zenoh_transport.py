@@ -4,29 +4,85 @@ Only the files named `zenoh_*.py` import Zenoh. What Zenoh needs of its user (me
   - Congestion control BLOCK is not flow control: Zenoh disconnects a peer that stalls, and drops all that the peer
     had queued. So rollouts are queries that are answered, and snapshots are put with DROP.
   - A process that ends with a callback declared and its session open hangs for ever: call `close` in a `finally`.
-  - Closing a dead connection blocks one of two receiving threads for 10 s: linger.py prevents this.
+  - Closing a dead connection blocks one of two receiving threads for 10 s: `Linger` below prevents this.
 """
 
 import contextlib
+import functools
 import logging
+import os
+import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import zenoh
 
 from daedalus.protocol.limits import LEARNER_LIMITS
-from daedalus.transport.credentials import Credentials, CredentialsError
-from daedalus.transport.credentials_watch import CredentialsWatch
+from daedalus.transport.credentials import Credentials, CredentialsError, CredentialsWatch
 from daedalus.transport.interface import Declaration, Inbox, OnAnswer, Request, Transport, TransportError
-from daedalus.transport.linger import linger_removal
 from daedalus.transport.slow_calls import SlowCall
-from daedalus.transport.zenoh_callbacks import Callbacks
-from daedalus.transport.zenoh_declarations import Declarations, Declared
-from daedalus.transport.zenoh_messages import ZenohInbox, ZenohPresence, ZenohRequest
-from daedalus.transport.zenoh_senders import Senders
+from daedalus.transport.zenoh_declarations import (
+    Callbacks,
+    Declarations,
+    Declared,
+    Senders,
+    ZenohInbox,
+    ZenohPresence,
+    ZenohRequest,
+)
 from daedalus.transport.zenoh_session import OpenSession, error_text, session_opener
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
+
+_DESCRIPTORS = Path("/dev/fd")  # of this process
+_LINGER = struct.Struct("ii")  # whether close() waits, and for how many seconds
+_ZENOHS_LINGER = _LINGER.pack(1, 10)
+_PAUSE_SECONDS = 0.5  # so that many connections that are opened at the same time are found together
+
+
+class LingerRemoval:
+    """Removal of the option from every connection of this process. Has its own thread, which never ends."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Event()
+        threading.Thread(target=self._remove_repeatedly, name="linger removal", daemon=True).start()
+
+    def connections_changed(self, *_: Any) -> None:
+        """Note that a connection was opened. From any thread."""
+        self._changed.set()
+
+    def _remove_repeatedly(self) -> None:
+        while self._changed.wait():
+            time.sleep(_PAUSE_SECONDS)
+            self._changed.clear()
+            remove_linger()
+
+
+@functools.cache
+def linger_removal() -> LingerRemoval:
+    """Return the one of this process."""
+    return LingerRemoval()
+
+
+def remove_linger() -> None:
+    """Remove the option that Zenoh sets from all connections of this process."""
+    for entry in os.listdir(_DESCRIPTORS) if _DESCRIPTORS.is_dir() else ():
+        with contextlib.suppress(OSError):  # not a socket, or closed meanwhile
+            _remove_from(int(entry))
+
+
+def _remove_from(descriptor: int) -> None:
+    # The family has no effect on the option. `detach` leaves the descriptor open: it is Zenoh's.
+    connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=descriptor)
+    try:
+        if connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.size) == _ZENOHS_LINGER:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.pack(0, 0))
+    finally:
+        connection.detach()
+
 
 _logger = logging.getLogger(__name__)
 

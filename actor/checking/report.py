@@ -2,9 +2,9 @@
 
 from pydantic import Field
 
+from daedalus.protocol.models import Specification
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.specification import Specification
 
 _SLOW_SECONDS = 0.005  # a step of a few milliseconds costs more than the exchange with another process
 _WIDE = 1e6  # from bound to bound of an action: the policy explores a hundredth of it to the end

@@ -6,8 +6,8 @@ import numpy as np
 
 from daedalus.actor.collecting.episode_counter import EpisodeCounter
 from daedalus.actor.environments.interface import Observed
-from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.noise import Noise, draw_noise
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces

@@ -4,8 +4,8 @@ import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import Observed
-from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.noise import Noise
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import Spaces, unfit_number

@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable
 
 from daedalus.protocol import keys
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import ClientReport
 from daedalus.transport.interface import QuerySender, TransportError
 
 _PAUSE_SECONDS = 2.0  # between two reports

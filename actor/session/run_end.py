@@ -5,9 +5,8 @@ from collections.abc import Callable
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
-from daedalus.protocol.epochs import starts_of
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
-from daedalus.protocol.messages import RunEnded
+from daedalus.protocol.messages import RunEnded, starts_of
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.interface import Inbox, Transport
 

@@ -26,9 +26,8 @@ from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_maker import RolloutUploadMaker, UploadMaker, make_upload_maker
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.protocol import keys
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Join, Snapshot, Welcome
+from daedalus.protocol.messages import ClientReport, Join, Snapshot, Welcome
 from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import Transport

@@ -19,8 +19,7 @@ from benchmarks.running import COMMAND
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import StatusReport
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.messages import ActorStatus, RunStatus, StatusReport
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.zenoh_transport import connect
 

@@ -32,10 +32,9 @@ from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_code import frames_of, is_of_user
 from daedalus.protocol.messages import Welcome
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import Credentials, NotValidNowError
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect
 from daedalus.transport.interface import TransportError, UnreachableError
 from daedalus.transport.retries import Retries
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 

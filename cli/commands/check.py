@@ -167,7 +167,7 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     from daedalus.policy.acting.program import export_program
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
-    from daedalus.policy.network.errors import NetworkError
+    from daedalus.policy.user_modules import NetworkError
 
     try:
         network = ActorCritic(spec.policy, spaces, modules, spec.training)

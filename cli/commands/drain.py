@@ -10,12 +10,11 @@ from daedalus.cli.status_query import ask, decoded, newest_of_each_run, no_answe
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
-from daedalus.protocol.messages import Acknowledgement, Refusal
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunStatus
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.connecting import connect_until_interrupted
+from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 LEFT, FAILED = 0, 1
 

@@ -12,12 +12,11 @@ from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.cli.processes import status_at_start, stop_on_signals
 from daedalus.cli.status_query import ask
 from daedalus.protocol.codec import ProtocolError
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import RunStatus
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import Credentials
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.slow_calls import SlowCall
 
 if TYPE_CHECKING:

@@ -33,10 +33,9 @@ from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys
 from daedalus.transport.addresses import AddressError, check_listening
-from daedalus.transport.credentials import Credentials, NotValidNowError, load
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect, load
 from daedalus.transport.interface import TransportError
 from daedalus.transport.retries import Retries
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 LISTEN = "127.0.0.1:8080"
 

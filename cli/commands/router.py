@@ -8,12 +8,10 @@ from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.cli.processes import raise_descriptor_limit, status_at_start, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN
-from daedalus.transport.addresses import check_connecting
+from daedalus.transport.addresses import check_connecting, reachable
 from daedalus.transport.connecting import listen
-from daedalus.transport.credentials import CredentialsError
+from daedalus.transport.credentials import SECURITY_ERRORS, CredentialsError, credentials_to_listen
 from daedalus.transport.interface import TransportError
-from daedalus.transport.reachable import reachable
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _logger = logging.getLogger(__name__)

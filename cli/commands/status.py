@@ -16,12 +16,11 @@ from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
-from daedalus.protocol.status import ActorStatus, EventsPage, RefusedJoin, RunStatus
+from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import one_line, printable, short_number
 from daedalus.transport.connecting import connect_until_interrupted
-from daedalus.transport.credentials import WARNING_DAYS, Credentials
+from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
 from daedalus.transport.interface import TransportError
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
 

@@ -60,7 +60,7 @@ from daedalus.policy.user_modules import (
 )
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
+from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
 
 _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows their progress. When the training episodes reach the

@@ -16,7 +16,7 @@ from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.hub import LIMITS, HubError, check_repository, hub_api, hub_errors
 from daedalus.policy.saving.saved_policy import SavedPolicy, export_policy, find_policy
 from daedalus.policy.saving.sealed import MANIFEST
-from daedalus.protocol.redaction import is_secret
+from daedalus.protocol.texts import is_secret
 from daedalus.transport.private_address import private_folder
 
 _logger = logging.getLogger(__name__)

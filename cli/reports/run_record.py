@@ -20,7 +20,7 @@ from daedalus.learner.run.event_file import RecordedEvent, read_events
 from daedalus.learner.run.run_directory import EVALUATION, EVENTS, OUTPUT, VERSIONS
 from daedalus.learner.run.run_files import RunDataError, read_json
 from daedalus.policy.saving.regular_files import open_regular
-from daedalus.protocol.redaction import without_secrets
+from daedalus.protocol.texts import without_secrets
 
 _MAX_OUTPUT_BYTES = 16 << 10
 _VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}

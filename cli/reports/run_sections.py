@@ -18,7 +18,7 @@ from daedalus.cli.reports.failures import failed_events, failure_counts, togethe
 from daedalus.cli.reports.markup import Child, Html, element, table
 from daedalus.cli.reports.run_record import RecordedEvaluation, RunRecord, finite
 from daedalus.learner.run.run_directory import CONFIG
-from daedalus.protocol.redaction import without_secrets
+from daedalus.protocol.texts import without_secrets
 
 MAX_VIDEO_BYTES = 32 << 20
 _MOST_EVENTS = 200

@@ -13,7 +13,7 @@ from rich.text import Text
 from daedalus.cli.watching.sparkline import ASCII, BLOCKS, sparkline
 from daedalus.cli.watching.watched_run import WatchedRun
 from daedalus.learner.reporting.progress import duration
-from daedalus.protocol.status import ActorStatus
+from daedalus.protocol.messages import ActorStatus
 from daedalus.protocol.texts import one_line, short_number
 
 _WIDE = 60  # columns

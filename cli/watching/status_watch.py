@@ -7,7 +7,7 @@ from contextlib import suppress
 from daedalus.cli.watching.run_watcher import looks
 from daedalus.cli.watching.screen import Screen
 from daedalus.protocol import keys
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import RunStatus
 from daedalus.transport.interface import Transport
 
 _FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0

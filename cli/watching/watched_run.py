@@ -3,8 +3,7 @@
 import math
 
 from daedalus.learner.reporting.progress import StepRate
-from daedalus.protocol.metrics import MetricsReport
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import MetricsReport, RunStatus
 
 _RETURN = "episode_return_mean"
 _MAX_RETURNS = 4096  # then every second one is dropped

@@ -11,8 +11,8 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from daedalus.protocol.models import meanings
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.specification import meanings
 
 MARKER = "<!-- settings -->"
 _BOUNDS = {Ge: ("ge", "≥"), Gt: ("gt", ">"), Le: ("le", "≤"), Lt: ("lt", "<")}

@@ -9,7 +9,7 @@ from dataclasses import replace
 from daedalus.gateway.watching.observation import Observation
 from daedalus.gateway.watching.source import RunSource
 from daedalus.protocol.codec import ProtocolError
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.interface import TransportError
 
 _logger = logging.getLogger(__name__)

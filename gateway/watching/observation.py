@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from daedalus.protocol.status import ActorStatus, Event, RunStatus
+from daedalus.protocol.messages import ActorStatus, Event, RunStatus
 
 State = Literal[
     "connecting",  # the network is not reached yet

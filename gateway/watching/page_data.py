@@ -7,7 +7,7 @@ from typing import Protocol
 from daedalus.gateway.places import Places
 from daedalus.gateway.watching.observation import Observation
 from daedalus.gateway.watching.source import OtherRun
-from daedalus.protocol.orders import Order
+from daedalus.protocol.messages import Order
 
 MAX_VIEWERS = 32
 _OPERATORS = 4  # further pages, for operators

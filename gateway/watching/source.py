@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from daedalus.protocol.metrics import MetricsReport
-from daedalus.protocol.orders import Order
-from daedalus.protocol.status import EventsPage, RunStatus
+from daedalus.protocol.messages import EventsPage, MetricsReport, Order, RunStatus
 
 
 class RunSource(Protocol):

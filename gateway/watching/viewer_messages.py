@@ -4,7 +4,7 @@ import json
 from typing import Any, Literal, NamedTuple
 
 from daedalus.gateway.errors import ClientError
-from daedalus.protocol.orders import Order
+from daedalus.protocol.messages import Order
 
 MAX_BYTES = 4096
 

@@ -9,8 +9,8 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page, totals
+from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
 
 
 def episode_statistics(counters: RunCounters) -> dict[str, float]:

@@ -12,7 +12,7 @@ from daedalus.learner.reporting.report import metrics_row, run_status, summary
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import RunStatus
 
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner

@@ -1,6 +1,6 @@
 """The file events.jsonl of a run directory: what happened in a run, from all its learner processes and the launcher.
 
-One JSON object a line, with the fields of protocol/status.py's Event. The kind "restarted" is that of the launcher.
+One JSON object a line, with the fields of protocol/messages.py's Event. The kind "restarted" is that of the launcher.
 """
 
 import json
@@ -13,9 +13,8 @@ from typing import Any
 
 from daedalus.learner.run.run_directory import EVENTS
 from daedalus.policy.saving.regular_files import append_own, read_regular
-from daedalus.protocol.redaction import without_secrets
-from daedalus.protocol.status import Event
-from daedalus.protocol.timestamps import utc
+from daedalus.protocol.messages import Event
+from daedalus.protocol.texts import utc, without_secrets
 
 RESTARTED = "restarted"
 RESUMED = "resumed: "  # begin of the text of the event "checkpoint" of a run that undoes what came after it

@@ -9,7 +9,7 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.evaluations import Evaluations
 from daedalus.learner.run.health import Health
 from daedalus.learner.run.run_directory import run_name
-from daedalus.protocol.epochs import new_epoch
+from daedalus.protocol.messages import new_epoch
 from daedalus.protocol.spec import RunSpec
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from daedalus.protocol.models import meanings
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.specification import meanings
 
 _FORMS = {"environment.wrap": "module:function"}  # of settings whose description does not begin with their form
 

@@ -38,11 +38,9 @@ from daedalus.protocol.limits import (
     STATUS_REQUEST_LIMITS,
     Limits,
 )
-from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
-from daedalus.protocol.orders import OrderRequest
+from daedalus.protocol.messages import Acknowledgement, OrderRequest, Refusal, RunEnded, RunStatus
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run

@@ -4,8 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from daedalus.learner.serving.sequence_window import SequenceWindow
-from daedalus.protocol.client_report import ClientReport
-from daedalus.protocol.messages import UNKNOWN, Origin
+from daedalus.protocol.messages import UNKNOWN, ClientReport, Origin
 from daedalus.protocol.texts import bounded_text
 
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined

@@ -11,9 +11,8 @@ from collections import deque
 from dataclasses import dataclass
 
 from daedalus.protocol import keys
-from daedalus.protocol.status import MAX_EVENTS, Event, EventKind
-from daedalus.protocol.texts import MAX_NAME, bounded_text
-from daedalus.protocol.timestamps import utc
+from daedalus.protocol.messages import MAX_EVENTS, Event, EventKind
+from daedalus.protocol.texts import MAX_NAME, bounded_text, utc
 
 _EQUAL_SECONDS = 60.0  # an equal event within this time is counted, not added
 _AT_ONCE, _PER_SECOND = 100.0, 1.0  # events of actors

@@ -18,8 +18,7 @@ from daedalus.learner.serving.former_incarnations import Former, FormerIncarnati
 from daedalus.learner.serving.presence import Presence
 from daedalus.learner.serving.refused_joins import RefusedJoins, bounded
 from daedalus.protocol import keys
-from daedalus.protocol.client_report import ClientReport
-from daedalus.protocol.messages import MAX_ENVIRONMENTS, Join, Refusal
+from daedalus.protocol.messages import MAX_ENVIRONMENTS, ClientReport, Join, Refusal
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import RolloutIdentity

@@ -4,8 +4,7 @@ import heapq
 from typing import TypedDict
 
 from daedalus.learner.serving.fleet import Actor, Fleet
-from daedalus.protocol.client_report import ClientReport
-from daedalus.protocol.status import PAGE_ACTORS, ActorStatus
+from daedalus.protocol.messages import PAGE_ACTORS, ActorStatus, ClientReport
 
 
 class FleetTotals(TypedDict):

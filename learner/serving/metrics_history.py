@@ -7,7 +7,7 @@ from itertools import islice
 import numpy as np
 
 from daedalus.learner.reporting.metrics import COLUMNS, GROUPS, MAX_COLUMNS
-from daedalus.protocol.metrics import MAX_PAGE_VALUES, MetricsPage, MetricsReport
+from daedalus.protocol.messages import MAX_PAGE_VALUES, MetricsPage, MetricsReport
 
 MAX_ROWS = 2000  # that are kept
 

@@ -4,8 +4,7 @@ import threading
 from collections.abc import Callable
 
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Acknowledgement, Refusal
-from daedalus.protocol.orders import Order
+from daedalus.protocol.messages import Acknowledgement, Order, Refusal
 from daedalus.transport.interface import Request
 
 _ANSWER_SECONDS = 3.0  # a gateway waits 5 s for its answer

@@ -10,12 +10,10 @@ import threading
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.requests import read_request
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
 from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS
-from daedalus.protocol.messages import Acknowledgement, Join, Origin, Program, Refusal, Welcome
+from daedalus.protocol.messages import Acknowledgement, ClientReport, EventKind, Join, Origin, Program, Refusal, Welcome
 from daedalus.protocol.spec import ActorSpec
-from daedalus.protocol.status import EventKind
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 
 

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 from daedalus.protocol import keys
-from daedalus.protocol.messages import Origin
-from daedalus.protocol.status import RefusedJoin
+from daedalus.protocol.messages import Origin, RefusedJoin
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 
 _MAX_ENTRIES = 32

@@ -14,16 +14,18 @@ from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.learner.serving.requests import read_request
 from daedalus.protocol.limits import STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import (
+    ActorsPage,
     ActorsReport,
     ActorsRequest,
+    EventsPage,
     EventsReport,
     EventsRequest,
     Message,
+    MetricsRequest,
     Refusal,
+    RunStatus,
     StatusReport,
 )
-from daedalus.protocol.metrics import MetricsRequest
-from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
 from daedalus.transport.interface import Request
 
 

@@ -16,9 +16,8 @@ from daedalus.actor import Client
 from daedalus.actor import client as client_module
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.errors import ActorError
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Acknowledgement, Refusal
+from daedalus.protocol.messages import Acknowledgement, ClientReport, Refusal
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 OBSERVATION = np.zeros(4, np.float32)

@@ -15,8 +15,7 @@ from daedalus.actor.session import learner_queries, runtime_maker, service, sess
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
-from daedalus.protocol.epochs import new_epoch
-from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome
+from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome, new_epoch
 from daedalus.transport.interface import RefusedError, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

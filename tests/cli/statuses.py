@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.messages import ActorStatus, RunStatus
 
 
 def actor_status(name: str, **changes: Any) -> ActorStatus:

@@ -10,8 +10,7 @@ from statuses import actor_status, run_status
 from daedalus.cli.watching.frame import frame, summary_frame
 from daedalus.cli.watching.sparkline import ASCII, sparkline
 from daedalus.cli.watching.watched_run import WatchedRun
-from daedalus.protocol.metrics import MetricsPage, MetricsReport
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import MetricsPage, MetricsReport, RunStatus
 
 
 def watched(status: RunStatus, *returns: float) -> WatchedRun:

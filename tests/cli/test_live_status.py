@@ -22,9 +22,7 @@ from daedalus.cli.watching.training_display import TrainingDisplay
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
-from daedalus.protocol.messages import StatusReport
-from daedalus.protocol.metrics import MetricsPage, MetricsReport, MetricsRequest
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import MetricsPage, MetricsReport, MetricsRequest, RunStatus, StatusReport
 from daedalus.transport.interface import Request, Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

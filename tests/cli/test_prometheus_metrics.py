@@ -9,7 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from statuses import actor_status, run_status
 
 from daedalus.cli.prometheus_metrics import metrics
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import RunStatus
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 

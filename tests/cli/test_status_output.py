@@ -9,8 +9,7 @@ from statuses import actor_status, run_status
 from daedalus.cli.commands.status import status as status_command
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import EventsReport, StatusReport
-from daedalus.protocol.status import Event, EventsPage, RefusedJoin, RunStatus
+from daedalus.protocol.messages import Event, EventsPage, EventsReport, RefusedJoin, RunStatus, StatusReport
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 CONNECT = ("--connect", "tcp/127.0.0.1:7447")

@@ -22,17 +22,23 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import (
+    MAX_EVENTS,
+    PAGE_ACTORS,
+    ActorsPage,
     ActorsReport,
     ActorsRequest,
+    Event,
+    EventsPage,
     EventsReport,
     Join,
     Message,
     Origin,
     Refusal,
+    RefusedJoin,
+    RunStatus,
     StatusReport,
 )
 from daedalus.protocol.spaces import DiscreteSpace
-from daedalus.protocol.status import MAX_EVENTS, PAGE_ACTORS, ActorsPage, Event, EventsPage, RefusedJoin, RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 MANY = 905

@@ -9,8 +9,8 @@ from pydantic import BaseModel
 from daedalus.cli.command_table import COMMANDS
 from daedalus.cli.main import USAGE
 from daedalus.learner.reporting.metrics import GROUPS
+from daedalus.protocol.models import meanings
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.specification import meanings
 
 SETTINGS = hook("settings_reference").settings_tables().splitlines()
 REFERENCE = hook("command_reference")

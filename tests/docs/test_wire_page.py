@@ -10,8 +10,8 @@ from pages import DOCS
 from daedalus.protocol import messages
 from daedalus.protocol.algorithms import ActorDemands
 from daedalus.protocol.codec import PROTOCOL_VERSION
+from daedalus.protocol.messages import ActorStatus, Event, EventKind, RunStatus
 from daedalus.protocol.spec import ActorSpec, CollectionSpec, EnvironmentSpec, EvaluatorSpec, LearningSpec
-from daedalus.protocol.status import ActorStatus, Event, EventKind, RunStatus
 
 WIRE = (DOCS / "wire.md").read_text("utf-8")
 TABLES = ["Join", "Welcome", "Refusal", "Program", "Snapshot", "Rollout", "Gradient", "Acknowledgement"]

@@ -19,8 +19,7 @@ from daedalus.cli.commands.certs import certs
 from daedalus.cli.status_query import ask
 from daedalus.gateway.places import Places
 from daedalus.gateway.tokens import OperatorToken
-from daedalus.protocol.orders import Order
-from daedalus.protocol.status import Event
+from daedalus.protocol.messages import Event, Order
 from daedalus.transport.connecting import connect
 from daedalus.transport.memory import MemoryNetwork
 

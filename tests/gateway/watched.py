@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from daedalus.gateway.watching.observation import Observation
-from daedalus.protocol.metrics import MetricsPage, MetricsReport
-from daedalus.protocol.orders import Order
-from daedalus.protocol.status import ActorStatus, Event, EventsPage, RunStatus
+from daedalus.protocol.messages import ActorStatus, Event, EventsPage, MetricsPage, MetricsReport, Order, RunStatus
 from daedalus.transport.interface import TransportError
 
 HOSTILE = '<img src=x onerror="document.title=1">'  # a text of a peer

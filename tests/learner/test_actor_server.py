@@ -21,6 +21,7 @@ from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ActorsPage,
     ActorsReport,
     EvaluationReport,
     EvaluationRequest,
@@ -28,11 +29,11 @@ from daedalus.protocol.messages import (
     Message,
     Refusal,
     RunEnded,
+    RunStatus,
     Snapshot,
     SnapshotRequest,
 )
 from daedalus.protocol.spec import RunSpec, TrainingSpec
-from daedalus.protocol.status import ActorsPage, RunStatus
 from daedalus.protocol.uploads import Rollout
 from daedalus.transport.interface import Request, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport

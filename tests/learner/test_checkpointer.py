@@ -29,7 +29,7 @@ from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training, keep_if_best
 from daedalus.policy.saving.saved_policy import checkpoints, find_policy, read_policy
 from daedalus.policy.saving.sealed import SealedDirectory
-from daedalus.protocol.epochs import new_epoch
+from daedalus.protocol.messages import new_epoch
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 
 

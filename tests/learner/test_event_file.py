@@ -7,7 +7,7 @@ import pytest
 
 from daedalus.learner.run import event_file
 from daedalus.learner.run.event_file import EventFile, read_events
-from daedalus.protocol.status import Event
+from daedalus.protocol.messages import Event
 
 
 def event(text: str = "left", count: int = 1, time: str = "2026-11-22T10:15:00.250Z") -> Event:

@@ -6,9 +6,8 @@ from building import SPACES, identity, joined_fleet
 from daedalus.learner.serving import fleet as fleet_module
 from daedalus.learner.serving import fleet_status, former_incarnations, presence
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.messages import Join, Refusal
+from daedalus.protocol.messages import PAGE_ACTORS, Join, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.protocol.status import PAGE_ACTORS
 
 WINDOW = 1024
 MINUTE = 60.0

@@ -39,9 +39,8 @@ from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, read_p
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, StatusReport
+from daedalus.protocol.messages import Acknowledgement, Join, RunStatus, StatusReport
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

@@ -11,8 +11,7 @@ from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
-from daedalus.protocol.messages import Acknowledgement, Join, Message, Refusal
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import Acknowledgement, Join, Message, Refusal, RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 MIB = 1 << 20

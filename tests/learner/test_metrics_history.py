@@ -12,7 +12,7 @@ from daedalus.learner.serving import metrics_history
 from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import METRICS_LIMITS
-from daedalus.protocol.metrics import MAX_PAGE_VALUES, MetricsReport
+from daedalus.protocol.messages import MAX_PAGE_VALUES, MetricsReport
 
 
 def all_pages(history: MetricsHistory) -> list[MetricsReport]:

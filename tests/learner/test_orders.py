@@ -11,9 +11,15 @@ from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import METRICS_LIMITS, Limits
-from daedalus.protocol.messages import Acknowledgement, EventsRequest, Message, Refusal
-from daedalus.protocol.metrics import MetricsReport, MetricsRequest
-from daedalus.protocol.orders import OrderRequest
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    EventsRequest,
+    Message,
+    MetricsReport,
+    MetricsRequest,
+    OrderRequest,
+    Refusal,
+)
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 

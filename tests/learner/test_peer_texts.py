@@ -11,11 +11,19 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page, totals
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, Limits
-from daedalus.protocol.messages import ActorsReport, Join, Origin, Refusal, StatusReport
-from daedalus.protocol.status import PAGE_ACTORS, ActorsPage, RunStatus
+from daedalus.protocol.messages import (
+    PAGE_ACTORS,
+    ActorsPage,
+    ActorsReport,
+    ClientReport,
+    Join,
+    Origin,
+    Refusal,
+    RunStatus,
+    StatusReport,
+)
 
 FACE = "\U0001f600"  # four bytes in UTF-8
 ORIGIN = Origin(host=FACE * 64, software=FACE * 64, address=FACE * 64)

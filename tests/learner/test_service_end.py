@@ -24,9 +24,7 @@ from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Message, Refusal, StatusReport
-from daedalus.protocol.orders import OrderRequest
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.messages import Acknowledgement, Message, OrderRequest, Refusal, RunStatus, StatusReport
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 ACTORS = 15

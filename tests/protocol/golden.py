@@ -8,35 +8,42 @@ from pathlib import Path
 
 import numpy as np
 
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import FIRST_VERSION, encode
 from daedalus.protocol.compact import bfloat16, planes
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ActorsPage,
     ActorsReport,
     ActorsRequest,
+    ActorStatus,
+    ClientReport,
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
+    Event,
+    EventsPage,
     EventsReport,
     EventsRequest,
     Join,
     Message,
+    MetricsPage,
+    MetricsReport,
+    MetricsRequest,
+    OrderRequest,
     Origin,
     Program,
     Refusal,
+    RefusedJoin,
     RunEnded,
+    RunStatus,
     Snapshot,
     SnapshotPart,
     SnapshotRequest,
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.metrics import MetricsPage, MetricsReport, MetricsRequest
-from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
-from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.uploads import Gradient, Rollout, RolloutIdentity
 
 FOLDER = Path(__file__).parent / "golden"

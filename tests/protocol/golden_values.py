@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from golden import FOLDER, MESSAGES
 
-from daedalus.protocol import schema
+from daedalus.protocol import codec
 from daedalus.protocol.codec import FIRST_VERSION
 
 PATH: Path = FOLDER / f"v{FIRST_VERSION}" / "values.json"
@@ -22,7 +22,7 @@ def values() -> dict[str, Any]:
     described = {}
     for name, message in MESSAGES.items():
         arrays: list[tuple[str, np.ndarray]] = []
-        fields = schema.pack(message, "", arrays)
+        fields = codec.pack(message, "", arrays)
         described[name] = {
             "kind": type(message).__name__,
             "fields": fields,

@@ -6,29 +6,37 @@ import numpy as np
 from hypothesis import strategies as st
 from wire_format import DTYPES, bits
 
-from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ActorsPage,
     ActorsReport,
     ActorsRequest,
+    ActorStatus,
+    ClientReport,
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
+    Event,
+    EventsPage,
     EventsReport,
     EventsRequest,
     Join,
+    MetricsPage,
+    MetricsReport,
+    MetricsRequest,
+    OrderRequest,
     Origin,
     Program,
     Refusal,
+    RefusedJoin,
     RunEnded,
+    RunStatus,
     Snapshot,
     SnapshotPart,
     SnapshotRequest,
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.metrics import MetricsPage, MetricsReport, MetricsRequest
-from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
     CollectionSpec,
@@ -39,7 +47,6 @@ from daedalus.protocol.spec import (
     ServiceSpec,
     TrainingSpec,
 )
-from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.uploads import Gradient, Rollout, RolloutIdentity
 
 text = st.text(max_size=20)

@@ -8,7 +8,8 @@ from pydantic import ValidationError
 from daedalus.protocol.algorithms import ALGORITHMS, ActorDemands
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import JOIN_LIMITS
-from daedalus.protocol.messages import Join
+from daedalus.protocol.messages import ActorStatus, Join, RunStatus
+from daedalus.protocol.models import Specification
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
     ActorSpec,
@@ -21,8 +22,6 @@ from daedalus.protocol.spec import (
     TrainingSpec,
     UnsupportedRunError,
 )
-from daedalus.protocol.specification import Specification
-from daedalus.protocol.status import ActorStatus, RunStatus
 
 ENVIRONMENT = {"id": "CartPole-v1"}
 ARRAY = {"kind": "array", "shape": [4], "dtype": "float32"}

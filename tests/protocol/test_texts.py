@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daedalus.protocol.redaction import without_secrets
-from daedalus.protocol.texts import bounded_text, one_line, printable, short_number
+from daedalus.protocol.texts import bounded_text, one_line, printable, short_number, without_secrets
 
 offline = settings(max_examples=200, deadline=None, derandomize=True)
 

@@ -9,8 +9,8 @@ import numpy as np
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.updates import updates_of
 from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.status import RunStatus
 from daedalus.protocol.uploads import Upload
 from daedalus.transport.interface import TransportError
 

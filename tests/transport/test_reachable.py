@@ -1,11 +1,11 @@
-"""transport/reachable.py: addresses that other hosts can connect to."""
+"""transport/addresses.py: addresses that other hosts can connect to."""
 
 import socket
 
 import pytest
 
-from daedalus.transport import reachable as module
-from daedalus.transport.reachable import reachable
+from daedalus.transport import addresses as module
+from daedalus.transport.addresses import reachable
 
 
 def test_an_address_of_a_host_stays_as_it_is() -> None:

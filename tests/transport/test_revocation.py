@@ -16,7 +16,7 @@ from test_access_control import listen_somewhere
 
 from daedalus.cli.certificate_folder import CertificateFolder, Identity
 from daedalus.protocol import keys
-from daedalus.transport import credentials_watch
+from daedalus.transport import credentials
 from daedalus.transport.credentials import Credentials, CredentialsError, load
 from daedalus.transport.interface import RefusedError, Request, Transport, TransportError
 from daedalus.transport.zenoh_session import session_opener
@@ -28,7 +28,7 @@ ARM, BOX, LATE = (Identity("actor", name) for name in ("arm", "box", "late"))
 
 @pytest.fixture(autouse=True)
 def _poll_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(credentials_watch, "_POLL_SECONDS", 0.05)
+    monkeypatch.setattr(credentials, "_POLL_SECONDS", 0.05)
 
 
 @pytest.fixture

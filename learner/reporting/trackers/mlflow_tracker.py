@@ -10,7 +10,7 @@ from typing import Any
 
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.trackers.tracker import PROJECT, SUMMARY, TrackedRun, flat, tagged
-from daedalus.protocol.redaction import without_secrets
+from daedalus.protocol.texts import without_secrets
 
 # MLflow's own defaults make a call to a server that does not answer last for many minutes.
 _HTTP = {"MLFLOW_HTTP_REQUEST_TIMEOUT": "20", "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1"}

@@ -17,7 +17,7 @@ UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 class Specification(BaseModel):
     """Base of all models: immutable, rejects unknown fields and numbers that are not finite.
 
-    In a message, unknown fields are ignored: schema.py reads it.
+    In a message, unknown fields are ignored: codec.py reads it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
