@@ -5,10 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from certificates import make_certificates
+from certificates import change_certificates, make_certificates
 from processes import Running, until
-
-from daedalus.cli.commands.certs import certs
 
 Start = Callable[..., Running]
 
@@ -55,10 +53,10 @@ def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls
     box = start("actor", "--connect", tls, "--tls", certificates / "actor-box")
     for actor in (arm, box):
         actor.expect("joined run")
-    assert certs(["revoke", "actor", "arm", "--directory", str(certificates)]) == 0
+    change_certificates(certificates, "revoke actor arm")
     assert arm.wait() == 1
     arm.expect(r"the service at .* refuses the certificate in .*kept: it was revoked, or issued after")
-    assert certs(["issue", "actor", "late", "--directory", str(certificates)]) == 0
+    change_certificates(certificates, "issue actor late")
     router.expect("2 actors and 1 operators are authorised; all connections are renewed")
     trained = len(learner.lines)
     start("actor", "--connect", tls, "--tls", certificates / "actor-late").expect("joined run")
