@@ -21,23 +21,15 @@ def tls(address: str) -> str:
     return address.replace("tcp/", "tls/")
 
 
-def test_authorised_actors_solve_cartpole_over_tls(start: Start, tls: str, certificates: Path) -> None:
-    learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
-    arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
-    box = start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box")
-    arm.expect(r"joined run 'run' as 'arm\.[\w-]+-\d+'")
-    box.expect("joined run")
-    assert learner.wait() == 0, learner.output
-    assert arm.wait() == 0, arm.output
-
-
 def test_authorised_actors_of_other_machines_join_train_over_tls(start: Start, tls: str, certificates: Path) -> None:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     training = ("--listen", tls, "--tls", certificates / "learner", "--actors", 1, *endless)
     train = start("train", "cartpole", *training)
     train.expect("return .* actors 1")
-    start("actor", "--connect", tls, "--tls", certificates / "actor-arm").expect("joined run")
-    train.expect("actors 2")
+    arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
+    arm.expect(r"joined run .* as 'arm\.[\w-]+-\d+'")
+    start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box").expect("as 'box'")
+    train.expect("actors 3")
     asking = ("status", "--connect", tls, "--quiet", "--tls")
     assert start(*asking, certificates / "actor-arm").wait() == 2
     until(lambda: start(*asking, certificates / "operator").wait() == 0)
