@@ -10,7 +10,7 @@ from daedalus.learner.reporting.run_records import RunRecords
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
-from daedalus.learner.serving.orders import Orders
+from daedalus.learner.serving.query_responses import Orders
 from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.learner.training.checkpointer import Checkpointer
 from daedalus.learner.training.learner import Learner

@@ -8,7 +8,7 @@ from daedalus.learner.reporting.metrics import ENV
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.fleet_status import page, totals
+from daedalus.learner.serving.query_responses import page, totals
 from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.spec import RunSpec
 

@@ -10,11 +10,10 @@ from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
-from daedalus.learner.run.event_file import RESUMED
 from daedalus.learner.run.run_directory import EVALUATION, METRICS, SUMMARY, read_json, write_json
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.serving.events import EventLog
+from daedalus.learner.serving.events import RESUMED, EventLog
 from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.policy.saving.best_checkpoints import set_aside_newer
 

@@ -13,7 +13,7 @@ Start = Callable[..., Running]
 # A module, and an assignment in it that makes the named thread raise the next time it works.
 LEARNER_FAULTS = {
     "intake": "daedalus.learner.serving.rollout_judge:RolloutJudge.read",
-    "compact snapshots": "daedalus.learner.serving.compact_snapshot_cache:CompactSnapshotCache.answer",
+    "compact snapshots": "daedalus.learner.serving.snapshot_publisher:CompactSnapshotCache.answer",
     "recorder": "daedalus.learner.reporting.csv_writer:CsvWriter.write",
     "session watchdog": "daedalus.learner.serving.session_watchdog:SessionWatchdog._watch",
     "a Zenoh thread that reports presence": "daedalus.learner.serving.fleet:Fleet.set_present",

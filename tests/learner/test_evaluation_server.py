@@ -8,9 +8,8 @@ import pytest
 from building import EPOCH, SPACES, run_spec
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.evaluations import Evaluated, Evaluations
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.evaluation_server import EvaluationServer
+from daedalus.learner.serving.evaluation_server import Evaluated, Evaluations, EvaluationServer
 from daedalus.learner.training.checkpointer import Saving
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
