@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable
 from types import MappingProxyType
 
+from daedalus.learner.reporting.metrics_rows import MetricsHistory
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.evaluation_server import EvaluationQueue
+from daedalus.learner.serving.evaluations import EvaluationQueue
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.learner.serving.query_responses import Orders, QueryResponses, StatusResponses, read_request
 from daedalus.learner.serving.rollout_intake import POLL_SECONDS, RolloutIntake
 from daedalus.learner.serving.session_watchdog import LOOK, SessionWatchdog

@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 from typing import TypedDict, TypeVar
 
+from daedalus.learner.reporting.metrics_rows import MetricsHistory
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
-from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
 from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS, STATUS_REQUEST_LIMITS, Limits
 from daedalus.protocol.messages import (

@@ -21,8 +21,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 from types import MappingProxyType
 
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.updates import updates_of
+from daedalus.learner.run.counters import RunCounters, updates_of
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import NON_FINITE, Actor, Fault, Fleet
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts

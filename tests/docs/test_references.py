@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 from daedalus.cli.command_table import COMMANDS
 from daedalus.cli.main import USAGE
-from daedalus.learner.reporting.metrics import GROUPS
+from daedalus.learner.reporting.metrics_rows import GROUPS
 from daedalus.protocol.models import meanings
 from daedalus.protocol.spec import RunSpec
 

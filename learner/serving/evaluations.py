@@ -1,18 +1,19 @@
-"""Answers to evaluators, made on the learner's thread between two updates. Not a thread of its own."""
+"""Evaluations: messages of evaluators that wait for the learner's thread, what is in progress, and its results.
+
+The checkpoint of a policy is kept while an evaluator plays the policy. The best checkpoints are kept permanently.
+"""
 
 import math
 import threading
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.query_responses import read_request
-from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -21,10 +22,6 @@ from daedalus.protocol.messages import Acknowledgement, EvaluationReport, Evalua
 from daedalus.protocol.texts import short_number
 from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER
 from daedalus.transport.interface import Request
-
-if TYPE_CHECKING:
-    from daedalus.learner.training.checkpointer import Checkpointer
-    from daedalus.learner.training.learner import Learner
 
 _MAX_WAITING = 64  # requests, and as many reports
 
@@ -140,7 +137,7 @@ class Evaluations:
     # By evaluator: checkpoint directory, policy version, env_steps.
     in_progress: dict[str, tuple[Path, int, int]] = field(default_factory=dict)
     heard: float = -math.inf  # when an evaluator last asked or reported, on the monotonic clock
-    newest: dict[str, float] = field(default_factory=dict)  # columns of learner/reporting/metrics.py, until taken
+    newest: dict[str, float] = field(default_factory=dict)  # columns of learner/reporting/metrics_rows.py, until taken
 
     @property
     def checkpoints_in_use(self) -> set[Path]:
@@ -193,59 +190,3 @@ class Evaluations:
         """Return the newest evaluation as metrics; empty without an evaluation since the last call."""
         newest, self.newest = self.newest, {}
         return newest
-
-
-# The policies of evaluators are saved, beside training. Requests wait until a save is due again, however many there
-# are, so that saving takes at most a twentieth of the time. An evaluator hardly notices.
-_MIN_SECONDS, _MAX_SECONDS = 0.5, 30.0  # between two saves; an evaluator waits 60 s for its answer
-_PAUSE_PER_SAVE = 20.0  # shortest pause, in durations of the last save
-
-
-class EvaluationServer:
-    """Answers the reports of evaluators, and hands out the newest policy to all evaluators that wait for one."""
-
-    def __init__(
-        self,
-        queue: EvaluationQueue,
-        evaluations: Evaluations,
-        publisher: SnapshotPublisher,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """`clock` returns the time on the monotonic clock, in seconds."""
-        self._queue, self._evaluations, self._publisher, self._clock = queue, evaluations, publisher, clock
-        self._saved_at, self._took = -math.inf, 0.0  # the last save, and how long it kept the learner from training
-
-    def serve(self, learner: "Learner", checkpointer: "Checkpointer", env_steps: int) -> None:
-        """Answer all waiting reports, and the waiting requests if a save is due.
-
-        Args:
-          learner: has the newest policy.
-          checkpointer: saves each policy that is handed out, because it may turn out to be the best.
-          env_steps: number of env_steps that the policy was trained on.
-        """
-        for request, report in self._queue.take_reports():
-            self._evaluations.heard = self._clock()
-            answer, evaluated = self._evaluations.report(report)
-            request.reply(encode(answer))
-            if evaluated is not None:
-                checkpointer.keep(evaluated)
-        pause = _PAUSE_PER_SAVE * max(self._took, checkpointer.seconds)
-        due = self._saved_at + min(max(pause, _MIN_SECONDS), _MAX_SECONDS)
-        if checkpointer.idle and self._clock() >= due:
-            self._hand_out(learner, checkpointer, env_steps)
-
-    def _hand_out(self, learner: "Learner", checkpointer: "Checkpointer", env_steps: int) -> None:
-        waiting = self._queue.take_requests()
-        if not waiting:
-            return
-        began = self._clock()
-        # Handed out before it is written: where the disk is slow or full, evaluations go on.
-        saving = checkpointer.begin(again=False)
-        version = learner.policy_version
-        if version != self._publisher.version:
-            self._publisher.publish(version, learner.weights())
-        for request, message in waiting:
-            self._evaluations.begin(message.evaluator, saving.directory, version, env_steps)
-            request.reply(self._publisher.newest())
-        self._saved_at = self._evaluations.heard = self._clock()
-        self._took = self._saved_at - began
