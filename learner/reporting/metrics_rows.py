@@ -1,4 +1,4 @@
-"""Metrics rows: their columns, the interface of a writer, reading them from metrics.csv, and their history for operators."""
+"""Metrics rows: their columns, the interface of a writer, reading metrics.csv, and the history of a whole run."""
 
 import csv
 import math

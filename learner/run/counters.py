@@ -1,4 +1,4 @@
-"""How far a run has come: counters and newest episodes, which are saved with every checkpoint, and annealed settings."""
+"""How far a run has come: annealed settings, and counters and newest episodes, which checkpoints save."""
 
 from collections import Counter, deque
 from collections.abc import Sequence

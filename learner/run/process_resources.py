@@ -1,8 +1,9 @@
-"""What a learner process needs of the operating system: file descriptors for the files of its run, and freed memory that stays.
+"""What a learner process sets up with the operating system: reserved file descriptors, and an allocator that is fast.
 
-Connections of peers use up all file descriptors that are not kept. A connection is accepted by the network's own threads,
-before anybody knows whose it is. So the limit of this process stays below what the system allows, and is raised only while
-a thread writes files."""
+Connections of peers use up all file descriptors that are not reserved for the files of the run. A connection is
+accepted by the network's own threads, before anybody knows whose it is. So the limit of this process stays below what
+the system allows, and is raised only while a thread writes files.
+"""
 
 import contextlib
 import ctypes

@@ -1,4 +1,7 @@
-"""What a run begins with or is resumed from: weights of another run, changed settings, whether it has finished. Without torch."""
+"""What a run begins with or is resumed from: weights of another run, changed settings, whether it has finished.
+
+Without torch, so that a command can import it early.
+"""
 
 import shlex
 from collections.abc import Sequence

@@ -140,7 +140,7 @@ def test_events_of_the_longest_texts_fit_the_limits_of_their_reader() -> None:
 def test_page_after_the_last_actor_is_empty(server: ActorServer, operator: MemoryTransport) -> None:
     report = query(operator, encode(ActorsRequest(after="zzz")))
     assert isinstance(report, ActorsReport)
-    assert run_reporter.page == ActorsPage(learner_epoch=EPOCH, actors=())
+    assert report.page == ActorsPage(learner_epoch=EPOCH, actors=())
 
 
 @pytest.mark.parametrize("payload", [b"x", encode(Join(actor="a", incarnation=1)), b"x" * 5000])

@@ -110,13 +110,3 @@ def test_rollouts_that_wait_for_room_keep_their_order_and_their_senders_wait(int
     assert intake.rollouts.take_batch(0) == []
     assert intake.answers(1) == [(4, "accepted")]
     assert intake.counters.rollouts_accepted == 5
-
-
-def test_requests_that_are_not_judged_in_time_are_answered_busy(
-    intake: Intake, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rollout_intake, "LATE_SECONDS", 0.3)
-    intake.offer(0, 1, 2, 3, 4)
-    assert intake.answers(4) == [(0, "accepted"), (1, "accepted"), (3, "busy"), (4, "busy")]
-    assert intake.batch() == [0, 1]
-    until(lambda: intake.counters.rollouts_accepted == 3)
