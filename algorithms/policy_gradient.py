@@ -27,7 +27,7 @@ class PolicyGradient(Algorithm):
         with torch.no_grad():
             targets = self.targets(batch, log_probs, values)
             shares = shares_of(batch.valid)
-            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages, batch.ranks)
+            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages)
         yield Losses(
             policy_loss=policy_gradient_loss(log_probs, factors, shares),
             entropies=entropies,
