@@ -69,6 +69,15 @@ def test_the_messages_about_certificates_are_those_of_the_code() -> None:
             assert words in sources, message
 
 
+def test_the_files_to_open_have_what_is_named_in_them() -> None:
+    """The tables of docs/architecture.md name a function or class of a file as `path` (`name`)."""
+    named = re.findall(r"`([\w/]+\.py)` \(`([\w.]+)`\)", (DOCS / "architecture.md").read_text("utf-8"))
+    assert len(named) > 5
+    for path, name in named:
+        pattern = rf"^\s*(class|def) {name.rpartition('.')[2]}\b|^{name} = "
+        assert re.search(pattern, (ROOT / path).read_text("utf-8"), re.MULTILINE), f"{path} {name}"
+
+
 def test_the_way_of_a_rollout_is_the_one_that_is_traced() -> None:
     """See docs/trace_rollout.py, which names what is missing and what is superfluous."""
     command = [sys.executable, str(DOCS / "trace_rollout.py"), "--check"]
