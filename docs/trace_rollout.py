@@ -167,8 +167,8 @@ def section(traced: dict[str, list[Function]]) -> str:
     functions = {each for passed in traced.values() for each in passed}
     files = {file for file, _ in functions}
     lines = [
-        f"One rollout passes **{len(functions)} functions in {len(files)} files**, in the order of the calls. Each file "
-        "has\nits number of functions. It is measured with CartPole, `impala` and the transport in memory."
+        f"One rollout passes **{len(functions)} functions in {len(files)} files**, in the order of the calls. "
+        "Each file has\nits number of functions. It is measured with CartPole, `impala` and the transport in memory."
     ]
     for thread, passed in traced.items():
         counts = collections.Counter(file for file, _ in passed)
