@@ -17,7 +17,7 @@ from daedalus.cli.arguments import (
 )
 from daedalus.cli.logs import add_logging
 from daedalus.cli.own_algorithm import with_record
-from daedalus.learner.reporting.trackers.tracker import TRACKERS
+from daedalus.learner.reporting.trackers.tracker import TRACKERS, tracker_name
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.resuming import differing, fixed_changes
@@ -116,10 +116,19 @@ def add_log(options: argparse._ActionsContainer) -> None:
         "--log",
         action="append",
         default=[],
-        choices=TRACKERS,
-        help="log the run to this tracker too, in addition to metrics.csv and TensorBoard. May be given several times. "
-        "`daedalus resume` continues the run there",
+        type=_tracker_name,
+        metavar="NAME",
+        help=f"log the run to this tracker too ({', '.join(TRACKERS)}), in addition to metrics.csv and TensorBoard, or "
+        "to a metrics writer of your own (module:Class). May be given several times. `daedalus resume` continues the "
+        "run at a tracker by itself",
     )
+
+
+def _tracker_name(name: str) -> str:
+    try:
+        return tracker_name(name)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def resolve(arguments: argparse.Namespace, defaults: dict[str, Any] | None = None) -> tuple[RunSpec, Path]:
