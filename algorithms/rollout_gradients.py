@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import BatchAssembler
-from daedalus.algorithms.diagnostics import BATCH_METRICS, batch_metrics, diagnostics
+from daedalus.algorithms.diagnostics import BATCH_METRICS, ActionCounts, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, restored, unpacked
 from daedalus.algorithms.gradients import GradientComputer

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from daedalus.actor.checking.report import EnvironmentReport, advice, never_ends
+from daedalus.actor.checking.check_report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
 from daedalus.cli.logs import print_error, say

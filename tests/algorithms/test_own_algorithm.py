@@ -24,8 +24,8 @@ MODULE = "own_algorithms"
 CODE = """
 import torch
 from daedalus.algorithms.algorithm import Algorithm
-from daedalus.algorithms.appo import Appo
-from daedalus.algorithms.a3c import A3c
+from daedalus.algorithms.policy_gradient import Appo
+from daedalus.algorithms.policy_gradient import A3c
 from daedalus.protocol.algorithms import AlgorithmRecord
 
 class Barrier(A3c):
