@@ -1,4 +1,4 @@
-"""actor/environments/atari.py: games of ALE look and begin on gymnasium as on ALE's own backend."""
+"""Games of ALE: its own backend, and the same games on gymnasium."""
 
 import sys
 from typing import Any

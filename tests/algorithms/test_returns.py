@@ -1,4 +1,4 @@
-"""algorithms/returns.py against slow reference sums, by identities, and by hand-worked examples."""
+"""Returns and targets by hand and against the sums of the papers, and the weights of explored rows."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The references of settings and commands, which are generated from the code."""
+"""Settings, public names and the wire format are documented, and what is documented exists."""
 
 import ast
 import dataclasses

@@ -1,4 +1,4 @@
-"""examples/own_loop.py and examples/several_agents.py against a real learner."""
+"""Loops that the caller owns, and actors where a system lacks what only POSIX has."""
 
 import json
 import sys

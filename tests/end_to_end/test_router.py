@@ -1,4 +1,4 @@
-"""Test of the router process."""
+"""Routers and the exporter, as processes."""
 
 import urllib.request
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Test of an actor on a slow link: 1 Mbit/s up, 4 Mbit/s down, 100 ms in each direction."""
+"""Actors on a slow link, and with slow environments."""
 
 import shutil
 from collections.abc import Callable

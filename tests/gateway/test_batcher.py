@@ -1,4 +1,4 @@
-"""Which clients' actions one call of the policy chooses, and when."""
+"""Which clients' actions one call chooses, and the threads that wait for the link in place of the event loop."""
 
 import asyncio
 import threading

@@ -1,4 +1,4 @@
-"""learner/run/run_directory.py: files of the run directory, and config.toml that reproduces the run."""
+"""The run directory: its files, its lock, and its events."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""Decoding arbitrary bytes gives a message or a ProtocolError."""
+"""Arbitrary bytes give a message or a ProtocolError, and each fault in a header is named."""
 
 import contextlib
 import copy

@@ -1,4 +1,4 @@
-"""None"""
+"""Shapes and dtypes that messages may have; compact weights."""
 
 import warnings
 from typing import Any

@@ -1,4 +1,4 @@
-"""protocol/texts.py: foreign texts, bounded in bytes, in one line and printable; numbers of any size."""
+"""Foreign texts, bounded and printable; names and keys."""
 
 import re
 

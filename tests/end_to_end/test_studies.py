@@ -1,4 +1,4 @@
-"""The lag study: the lag is exact, a run is determined by its seed, and an interrupted study goes on."""
+"""The studies: the lag is exact, a run repeats, and actors in simulated time are as fast as processes."""
 
 import csv
 import importlib

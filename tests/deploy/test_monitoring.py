@@ -1,4 +1,4 @@
-"""Test of deploy/prometheus: alerts use only metrics and labels that exist. promtool checks them if it is installed."""
+"""The alerts and the dashboard use metrics that the exporter has."""
 
 import json
 import re

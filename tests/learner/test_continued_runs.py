@@ -1,4 +1,4 @@
-"""learner/run/changes.py: which settings may change when a run is resumed."""
+"""What a run continues with: settings that may change, annealing, its end, and initial weights."""
 
 import json
 import shlex

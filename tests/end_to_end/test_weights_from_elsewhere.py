@@ -1,4 +1,4 @@
-"""A run with --init-from that was stopped before its first checkpoint, and is resumed, with real processes."""
+"""Weights of another run, and a policy that goes to the Hub and back."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""A run whose actors upload gradients: metrics, episodes, a checkpoint, a learner that is replaced. In memory."""
+"""Runs in memory: bit-for-bit the same as in several processes, and with gradients from actors."""
 
 import io
 import json
