@@ -1,51 +1,33 @@
-"""Settings, public names and the wire format are documented, and what is documented exists."""
+"""The references of settings, commands and the Python API, whose generated parts are in the repository."""
 
-import ast
-import dataclasses
 import re
-import typing
-from pathlib import Path
+import subprocess
+import sys
 
 import pytest
-from pages import DOCS, PAGES, ROOT, code_blocks, hook, inline_code, name_of
-from pydantic import BaseModel
+from pages import DOCS, ROOT
 
 from daedalus.cli.command_table import COMMANDS
+from daedalus.cli.commands.settings import Setting, all_settings
 from daedalus.cli.main import USAGE
 from daedalus.learner.reporting.metrics import GROUPS
-from daedalus.protocol import messages
-from daedalus.protocol.algorithms import ActorDemands
-from daedalus.protocol.codec import PROTOCOL_VERSION
-from daedalus.protocol.messages import ActorStatus, Event, EventKind, RunStatus
-from daedalus.protocol.models import meanings
-from daedalus.protocol.spec import ActorSpec, CollectionSpec, EnvironmentSpec, EvaluatorSpec, LearningSpec, RunSpec
-from daedalus.transport.credentials import CERTIFICATE, CLIENTS, KEY
 
-SETTINGS = hook("settings_reference").settings_tables().splitlines()
-REFERENCE = hook("command_reference")
+SETTINGS = {setting.path: setting for setting in all_settings()}
 
 
-def sections() -> dict[str, type[BaseModel]]:
-    return {
-        name: field.annotation
-        for name, field in RunSpec.model_fields.items()
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
-    }
+def test_the_generated_parts_of_the_references_are_those_of_the_code() -> None:
+    command = [sys.executable, str(DOCS / "generate_reference.py"), "--check"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
-FIELDS = [(section, key) for section, model in sections().items() for key in model.model_fields]
-
-
-@pytest.mark.parametrize(("section", "key"), FIELDS)
-def test_every_setting_has_a_meaning_and_a_row(section: str, key: str) -> None:
-    assert re.fullmatch(r"[^a-z].*[.]", meanings(sections()[section])[key])
-    rows = [row for row in SETTINGS if row.startswith(f"| `{section}.{key}` |")]
-    assert len(rows) == 1
-    assert rows[0].count("|") - rows[0].count("\\|") == 6
+@pytest.mark.parametrize("setting", SETTINGS.values(), ids=SETTINGS)
+def test_every_setting_has_a_meaning(setting: Setting) -> None:
+    assert re.fullmatch(r"[^a-z].*[.]", setting.meaning)
 
 
 @pytest.mark.parametrize(
-    ("setting", "kind", "limits", "default"),
+    ("name", "kind", "limits", "default"),
     [
         ("training.learning_rate", "float", "> 0, ≤ 1", "`0.001`"),
         ("training.max_policy_lag", "int", "≥ 0", "unset"),
@@ -57,9 +39,9 @@ def test_every_setting_has_a_meaning_and_a_row(section: str, key: str) -> None:
         ("training.stop_when_solved", "bool", "", "`true`"),
     ],
 )
-def test_rows_state_type_range_and_default(setting: str, kind: str, limits: str, default: str) -> None:
-    row = next(row for row in SETTINGS if row.startswith(f"| `{setting}` |"))
-    assert [cell.strip() for cell in row.split("|")[2:5]] == [kind, limits, default]
+def test_settings_state_type_range_and_default(name: str, kind: str, limits: str, default: str) -> None:
+    setting = SETTINGS[name]
+    assert (setting.kind, setting.limits, setting.default) == (kind, limits, default)
 
 
 def test_every_metric_is_in_the_reference_in_its_group() -> None:
@@ -73,153 +55,6 @@ def test_every_metric_is_in_the_reference_in_its_group() -> None:
 def test_every_command_is_in_the_reference() -> None:
     commands = re.findall(r"^  ([a-z]+) ", USAGE, re.MULTILINE)
     assert list(COMMANDS) == commands
-    text = REFERENCE.command_sections()
+    page = (DOCS / "reference" / "commands.md").read_text("utf-8")
     for command in [*commands, "certs init", "certs issue", "certs revoke"]:
-        assert f" daedalus {command}\n\n```text\nusage: daedalus {command} " in text
-
-
-FOLDERS = (
-    "actor|algorithms|benchmarks|cli|daedalus|deploy|docs|examples|gateway|learner|policy|protocol|tests|transport"
-)
-ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
-FILE_ENDINGS = {"py", "ts", "md", "toml", "json"}
-
-
-def anchor(heading: str) -> str:
-    """Return the anchor of a heading, as Markdown renderers make it."""
-    return re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-")
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_links_lead_somewhere(page: Path) -> None:
-    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
-        if re.match(r"\w+:", link):
-            continue
-        path, _, part = link.partition("#")
-        target = (page.parent / path) if path else page
-        assert target.exists(), link
-        if part and target.suffix == ".md":
-            headings = re.findall(r"^#+ (.*)$", target.read_text("utf-8"), re.MULTILINE)
-            assert part in {anchor(heading) for heading in headings}, link
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_files_exist(page: Path) -> None:
-    for code in inline_code(page.read_text("utf-8")):
-        for path in re.findall(rf"(?:^|\s)((?:{FOLDERS})/[\w./@-]*)", code):
-            if "NAME" not in path and not path.startswith(ZENOH_SETTINGS):
-                assert (ROOT / path).exists(), path
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_settings_exist(page: Path) -> None:
-    text = page.read_text("utf-8")
-    codes = [*inline_code(text), *code_blocks(text)]
-    sections = "|".join(RunSpec.model_fields)
-    for section, key in re.findall(rf"(?<![\w./:-])({sections})\.([a-z_]+)", "\n".join(codes)):
-        model = RunSpec.model_fields[section].annotation
-        assert isinstance(model, type)
-        assert issubclass(model, BaseModel)
-        assert key in model.model_fields or key in FILE_ENDINGS, f"{section}.{key}"
-
-
-def test_the_messages_about_certificates_are_those_of_the_code() -> None:
-    table = (DOCS / "security.md").read_text("utf-8").partition("| message |")[2].partition("\n\n")[0]
-    sources = "".join(path.read_text("utf-8") for path in (ROOT / "transport").glob("*.py"))
-    sources = sources.replace("{KEY}", KEY).replace("{CERTIFICATE}", CERTIFICATE)
-    sources = sources.replace("{CLIENTS}", CLIENTS)
-    messages = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
-    assert len(messages) > 4
-    for message in messages:
-        for words in filter(None, (part.strip() for part in message.split("..."))):
-            assert words in sources, message
-
-
-def test_the_way_of_a_rollout_names_functions_that_exist() -> None:
-    """At most 20 functions; `file.py` `Class.function` or `function`, each defined in that file."""
-    section = (DOCS / "architecture.md").read_text("utf-8").split("## A rollout's way")[1].split("\n## ")[0]
-    steps = re.findall(r"^(\d+)\. `([\w/]+\.py)` `([\w.]+)`: ", section, re.MULTILINE)
-    assert [int(number) for number, _, _ in steps] == list(range(1, len(steps) + 1))
-    assert len(re.findall(r"^\d+\. ", section, re.MULTILINE)) == len(steps)
-    assert 10 <= len(steps) <= 20
-    for _, path, name in steps:
-        assert name in defined(ROOT / path), f"{path} {name}"
-
-
-def defined(path: Path) -> set[str]:
-    """Return the functions of a file, methods as `Class.method`."""
-    body = ast.parse(path.read_text("utf-8")).body
-    classes = [node for node in body if isinstance(node, ast.ClassDef)]
-    functions = {node.name for node in body if isinstance(node, ast.FunctionDef)}
-    return functions | {
-        f"{owner.name}.{node.name}" for owner in classes for node in owner.body if isinstance(node, ast.FunctionDef)
-    }
-
-
-WIRE = (DOCS / "wire.md").read_text("utf-8")
-TABLES = ["Join", "Welcome", "Refusal", "Program", "Snapshot", "Rollout", "Gradient", "Acknowledgement"]
-TABLES += ["RunEnded", "SnapshotRequest", "SnapshotPart", "CompactSnapshot", "EvaluationReport", "ClientReport"]
-
-
-def first_column(table: str) -> set[str]:
-    """Return the names in the first column of a table's rows, `weights/NAME` as `weights`."""
-    rows = re.findall(r"^\|((?: `[\w/]+`,?)+) \|", table, re.MULTILINE)
-    return {name.split("/")[0] for row in rows for name in re.findall(r"`([\w/]+)`", row)}
-
-
-def table_after(start: str) -> str:
-    """Return the first table that follows a text."""
-    _, found, rest = WIRE.partition(start)
-    assert found, start
-    table = re.search(r"^\|.*?(?=\n\n|\Z)", rest, re.DOTALL | re.MULTILINE)
-    assert table
-    return table[0]
-
-
-def table_under(head: str) -> str:
-    """Return the rows of the table whose head begins so."""
-    _, found, rest = WIRE.partition(f"\n{head}")
-    assert found, head
-    return rest.partition("\n\n")[0]
-
-
-@pytest.mark.parametrize("message", TABLES)
-def test_a_messages_table_has_its_fields(message: str) -> None:
-    fields = {field.name for field in dataclasses.fields(getattr(messages, message))}
-    assert first_column(table_after(f"**{message}**")) == fields
-
-
-def test_every_message_is_on_the_page() -> None:
-    for message in typing.get_args(messages.Message):
-        assert f"{message.__name__}" in WIRE
-
-
-@pytest.mark.parametrize(("message", "field"), [("Refusal", "code"), ("Acknowledgement", "verdict")])
-def test_codes_and_verdicts_are_all_explained(message: str, field: str) -> None:
-    words = typing.get_args(typing.get_type_hints(getattr(messages, message))[field])
-    table = table_under("| code |") if field == "code" else table_after("### Verdicts")
-    assert first_column(table) == set(words)
-
-
-def test_the_status_tables_have_its_fields() -> None:
-    assert first_column(table_under("| of the run |")) == set(RunStatus.model_fields)
-    assert first_column(table_under("| of each actor |")) == set(ActorStatus.model_fields)
-    assert first_column(table_under("| of each event |")) == set(Event.model_fields)
-    kinds = table_under("| of each event |").partition("| `kind` |")[2].partition("\n")[0]
-    assert tuple(re.findall(r"`(\w+)`", kinds)) == typing.get_args(EventKind)
-
-
-def test_the_specifications_tables_have_what_an_actor_needs() -> None:
-    environment = first_column(table_under("| `environment.` |")) | {"backend", "processes"}  # named in the row of `id`
-    assert environment == set(EnvironmentSpec.model_fields)
-    assert first_column(table_under("| `collection.` |")) == set(CollectionSpec.model_fields) - {"actors"}
-    spec = table_under("| `spec.` |")
-    assert first_column(spec) == set(ActorSpec.model_fields)
-    for name, part in (("evaluation", EvaluatorSpec), ("algorithm", ActorDemands), ("learning", LearningSpec)):
-        row = spec.partition(f"| `{name}` |")[2].partition("\n")[0]
-        assert set(part.model_fields) <= set(re.findall(r"`(\w+)`", row))
-
-
-def test_the_page_is_for_this_version() -> None:
-    assert f"protocol version **{PROTOCOL_VERSION}**" in WIRE
-    assert f"`tests/protocol/golden/v{PROTOCOL_VERSION}/`" in WIRE
+        assert f"# daedalus {command}\n" in page

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -24,8 +25,7 @@ def far(start: Start, address: str) -> Callable[[], dict]:
 def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
     start: Start, address: str, far: Callable[[], dict]
 ) -> None:
-    proxy = SlowProxy(address, up=125e3, down=500e3, delay=0.1)
-    try:
+    with closing(SlowProxy(address, up=125e3, down=500e3, delay=0.1)) as proxy:
         actor = start("actor", "--connect", proxy.address, "--name", "far")
         actor.expect("slow link: .* fetching compact snapshots")
         until(lambda: far().get("rollouts_accepted", 0) > 20)
@@ -34,8 +34,6 @@ def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
         assert report["rollouts_missed"] == 0
         assert "unfit" not in report["rollouts_rejected"]
         until(lambda: 0 < far().get("bytes_down_per_hour", 0) < 3600 * 500e3)
-    finally:
-        proxy.close()
 
 
 def test_an_actor_with_link_wan_keeps_receiving_new_weights(

@@ -74,17 +74,13 @@ def test_config_toml_reads_back_as_the_same_run(tmp_path_factory: pytest.TempPat
     assert run_directory.read_config(directory) == spec
 
 
-def test_config_toml_contains_defaults(tmp_path: Path) -> None:
-    run_directory.write_config(tmp_path, run_spec())
-    text = (tmp_path / run_directory.CONFIG).read_text()
-    assert "discount_factor = 0.99" in text
-    assert "checkpoint_seconds = 60.0" in text
-
-
-def test_config_toml_can_be_used_as_a_preset(tmp_path: Path) -> None:
+def test_config_toml_contains_defaults_and_can_be_used_as_a_preset(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"is not a run directory: it has no config\.toml"):
+        run_directory.read_config(tmp_path)
     run_directory.create(tmp_path, run_spec(algorithm="a3c", seed=9))
-    again = run_spec_of(read_preset(str(tmp_path / run_directory.CONFIG)))
-    assert again == run_spec(algorithm="a3c", seed=9)
+    path = tmp_path / run_directory.CONFIG
+    assert "discount_factor = 0.99" in path.read_text()
+    assert run_spec_of(read_preset(str(path))) == run_spec(algorithm="a3c", seed=9)
 
 
 def test_new_run_directory_contains_config_and_versions(tmp_path: Path) -> None:
@@ -108,14 +104,6 @@ def test_only_its_owner_may_enter_a_new_run_directory(tmp_path: Path) -> None:
     assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o755  # a directory of the user's stays as it is
 
 
-def test_existing_run_directory_is_refused_and_unchanged(tmp_path: Path) -> None:
-    directory = tmp_path / "run"
-    run_directory.create(directory, run_spec(seed=1))
-    with pytest.raises(SettingsError, match=r"exists: continue the run with `daedalus resume .*run`"):
-        run_directory.create(directory, run_spec(seed=2))
-    assert run_directory.read_config(directory).training.seed == 1
-
-
 def test_empty_directory_is_accepted_and_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     run_directory.create(tmp_path / "empty", run_spec())
@@ -126,11 +114,6 @@ def test_empty_directory_is_accepted_and_a_file_is_refused(tmp_path: Path) -> No
         run_directory.create(tmp_path, run_spec())
     with pytest.raises(SettingsError, match="Not a directory"):
         run_directory.create(tmp_path / "file" / "run", run_spec())
-
-
-def test_read_config_refuses_a_directory_without_config_toml(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"is not a run directory: it has no config\.toml"):
-        run_directory.read_config(tmp_path)
 
 
 @pytest.mark.parametrize(
