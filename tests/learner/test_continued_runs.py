@@ -82,14 +82,15 @@ def test_setting_that_cannot_change_is_named_although_others_do_not_go_with_it()
         with_changes(before, ["training.learning_rate=7"], RUN)
 
 
-def test_progress_is_the_used_share_of_the_budget() -> None:
+def test_progress_is_the_used_share_of_the_budget_and_at_most_1() -> None:
     annealing = Annealing(budget=700)
     assert [annealing.at(env_steps) for env_steps in (0, 7, 123, 700, 800)] == [0.0, 7 / 700, 123 / 700, 1.0, 1.0]
-
-
-def test_resuming_with_the_same_budget_changes_nothing() -> None:
-    annealing = Annealing(budget=700)
     assert annealing.resumed(300, 700) is annealing
+    assert annealing.resumed(300, 200).at(300) == 1.0
+    used_up = annealing.resumed(705, 1400)
+    assert [used_up.at(env_steps) for env_steps in (705, 1000, 1400)] == [1.0, 1.0, 1.0]
+    resumed = annealing.resumed(300, 1100)
+    assert Annealing(**json.loads(json.dumps(resumed.state()))) == resumed
 
 
 @pytest.mark.parametrize("budget", [1400, 400])
@@ -103,20 +104,6 @@ def test_other_budget_continues_from_the_progress_that_was_reached(budget: int) 
     again = resumed.resumed(middle, 10_000)
     assert again.at(middle) == resumed.at(middle)
     assert again.at(10_000) == 1.0
-
-
-def test_run_that_has_used_its_budget_stays_at_the_final_values() -> None:
-    resumed = Annealing(budget=700).resumed(705, 1400)
-    assert [resumed.at(env_steps) for env_steps in (705, 1000, 1400)] == [1.0, 1.0, 1.0]
-
-
-def test_budget_that_is_used_up_already_is_the_end() -> None:
-    assert Annealing(budget=700).resumed(300, 200).at(300) == 1.0
-
-
-def test_restored_from_json_it_continues_equally() -> None:
-    resumed = Annealing(budget=700).resumed(300, 1100)
-    assert Annealing(**json.loads(json.dumps(resumed.state()))) == resumed
 
 
 TARGET = {"target_return": 10.0, "target_episodes": 3}
@@ -155,15 +142,12 @@ def test_a_run_that_reached_its_target_has_nothing_to_train(run: Path) -> None:
     assert end is not None
     assert end.reason.startswith("the target return 10 was reached, and 5,000 env_steps are done: train on with --set")
     assert (end.missed, end.to_evaluate) == (False, True)
+    assert finished(run, {"finished": False, "solved": False}, **TARGET) is None  # before new episodes confirmed it
     assert finished(run, {}, **TARGET, stop_when_solved=False) is None
     assert finished(run, {}, **{**TARGET, "target_return": 99.0}) is None
     missed = finished(run, {}, **{**TARGET, "target_return": 99.0}, env_steps=5000)
     assert missed is not None
     assert missed.missed
-
-
-def test_a_run_that_was_stopped_before_new_episodes_confirmed_its_target_has_to_train(run: Path) -> None:
-    assert finished(run, {"finished": False, "solved": False}, **TARGET) is None
 
 
 def test_a_run_that_an_evaluation_solved_has_nothing_to_train(run: Path) -> None:
