@@ -118,9 +118,6 @@ def test_batch_dtypes() -> None:
     assert batch.valid.dtype == batch.initial_state.dtype == torch.float32
     assert batch.terminated.dtype == batch.truncated.dtype == batch.starts.dtype == torch.bool
     assert batch.observations[NAME].dtype == batch.rewards.dtype == torch.float32
-
-
-def test_pixel_observations_stay_uint8() -> None:
     assert join([pixels(1)], PIXEL_SPACES).observations[NAME].dtype == torch.uint8
 
 
