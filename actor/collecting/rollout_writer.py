@@ -199,9 +199,10 @@ class RolloutWriter:
         # The row after a reset row is the first of its episode: its frame stack and memory begin anew.
         self._stacks.push(observed.frames, ~valid)
         self._current_masks = observed.masks
-        # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
-        goes_on = valid & np.isfinite(self._next_state).all(axis=1)
-        self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
+        if self._state.size:
+            # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
+            goes_on = valid & np.isfinite(self._next_state).all(axis=1)
+            self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
         self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
         self._row += 1
         return self._row == len(self._rewards)

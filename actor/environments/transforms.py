@@ -191,8 +191,7 @@ class TransformedEnvironment:
                 "after an episode's end, which only resets (AutoresetMode.NEXT_STEP): return terminated and truncated "
                 "False there"
             )
-        ignored = rewards[resets & (rewards != 0.0)]
-        if len(ignored) and not self._warned_of_rewards:
+        if not self._warned_of_rewards and len(ignored := rewards[resets & (rewards != 0.0)]):
             self._warned_of_rewards = True
             _logger.warning(
                 "environment %s: it gives the reward %g in a step that only resets after an episode's end "
