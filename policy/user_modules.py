@@ -125,14 +125,15 @@ class UserState:
         if self._depth == 1:
             self._ours = _kept_state()
             if self._theirs is not None:
-                _restore(self._theirs, self._ours)
+                _restore(self._theirs)
 
     def __exit__(self, *_error: object) -> None:
         self._depth -= 1
         if not self._depth:
-            now = _kept_state()
-            self._theirs = None if _are_same(now, self._ours) else now
-            _restore(self._ours, now)
+            now, self._theirs = _kept_state(), None
+            if not _are_same(now, self._ours):
+                self._theirs = now
+                _restore(self._ours)
 
     @contextmanager
     def watched(self) -> Iterator[None]:
@@ -144,7 +145,7 @@ class UserState:
             now = _kept_state()
             if not _are_same(now, ours):
                 self._theirs = now
-                _restore(ours, now)
+                _restore(ours)
 
     @contextmanager
     def undone(self) -> Iterator[None]:
@@ -170,13 +171,11 @@ def _are_same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
     return one == other or (one[1:] == other[1:] and one[0].run(np.geterr) == other[0].run(np.geterr))
 
 
-def _restore(state: tuple[Any, ...], now: tuple[Any, ...]) -> None:
-    """Set what differs from `now`."""
-    if not _are_same(state, now):
-        context, filters, sys.stdout, sys.stderr = state
-        np.seterr(**context.run(np.geterr))
-        warnings.resetwarnings()
-        warnings.filters[:] = filters  # pyright: ignore[reportIndexIssue]
+def _restore(state: tuple[Any, ...]) -> None:
+    context, filters, sys.stdout, sys.stderr = state
+    np.seterr(**context.run(np.geterr))
+    warnings.resetwarnings()
+    warnings.filters[:] = filters  # pyright: ignore[reportIndexIssue]
 
 
 def _undone_state() -> tuple[Any, ...]:

@@ -168,7 +168,7 @@ class TransformedEnvironment:
         """See VectorEnvironment."""
         observations, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
         ended = terminated | truncated
-        if self._ended.any():
+        if np.count_nonzero(self._ended):  # a tenth of the time of any()
             rewards = self._rewards_of_steps(rewards, ended)
         self._ended = ended
         if self._one_episode:
@@ -184,7 +184,7 @@ class TransformedEnvironment:
         own account and a real one by ours.
         """
         resets = self._ended
-        if (ended & resets).any():
+        if np.count_nonzero(ended & resets):
             number = np.flatnonzero(ended & resets)[0]
             raise EnvironmentSetupError(
                 f"environment {self._name}: environment {number} ends an episode in the step "
