@@ -84,7 +84,7 @@ def _values(group: Group, key: str) -> str:
     return " / ".join(sorted({setting_text(run.settings.get(key)) for run in group.runs}))
 
 
-def versions_section(groups: Sequence[Group], records: Records) -> Html | None:
+def versions_of_runs_section(groups: Sequence[Group], records: Records) -> Html | None:
     """Return the versions of the packages, one column for each set of versions that runs were started with."""
     columns: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for group in groups:

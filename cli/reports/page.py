@@ -5,10 +5,27 @@ from pathlib import Path
 
 from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import ENVIRONMENT
-from daedalus.cli.reports import group_sections, run_sections
 from daedalus.cli.reports.curves import curves, legend
+from daedalus.cli.reports.group_sections import (
+    Records,
+    comparison_of,
+    comparison_section,
+    differences_section,
+    runs_section,
+    versions_of_runs_section,
+)
 from daedalus.cli.reports.markup import Child, Html, element, escape, join
 from daedalus.cli.reports.run_record import RunRecord
+from daedalus.cli.reports.run_sections import (
+    evaluation_section,
+    failure_section,
+    repeat_section,
+    section,
+    settings_section,
+    summary_tiles,
+    versions_section,
+    video_section,
+)
 
 _STYLE = Path(__file__).with_name("style.css")
 # The browser itself enforces that the page loads nothing from elsewhere and runs no script.
@@ -37,20 +54,20 @@ def run_page(record: RunRecord, group: Group, by: str) -> str:
         record.name,
         _header(record.name, facts, record.status),
         element("p", unfinished, class_="note") if unfinished else None,
-        run_sections.summary_tiles(record),
+        summary_tiles(record),
         _curves([group], by),
-        run_sections.evaluation_section(record),
-        run_sections.video_section(record),
-        run_sections.failure_section(record),
-        run_sections.settings_section(record),
-        run_sections.versions_section(record),
-        run_sections.repeat_section(record),
+        evaluation_section(record),
+        video_section(record),
+        failure_section(record),
+        settings_section(record),
+        versions_section(record),
+        repeat_section(record),
     )
 
 
 def comparison_page(
     groups: Sequence[Group],
-    records: group_sections.Records,
+    records: Records,
     by: str,
     *,
     threshold: float | None,
@@ -66,7 +83,7 @@ def comparison_page(
       left_out: one line for each run that could not be read.
     """
     runs = [run for group in groups for run in group.runs]
-    comparison = group_sections.comparison_of(groups, threshold)
+    comparison = comparison_of(groups, threshold)
     environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
     title = f"{len(runs)} runs of {environment}" if environment else f"{len(runs)} runs"
     unfinished = [run.unfinished for run in runs if run.unfinished]
@@ -74,11 +91,11 @@ def comparison_page(
         title,
         _header(title, [f"{len(groups)} groups" if len(groups) > 1 else "1 group"], None),
         [element("p", line, class_="note") for line in [*left_out, *unfinished]],
-        group_sections.comparison_section(comparison),
+        comparison_section(comparison),
         _curves(groups, by),
-        group_sections.runs_section(groups, records),
-        group_sections.differences_section(groups),
-        group_sections.versions_section(groups, records),
+        runs_section(groups, records),
+        differences_section(groups),
+        versions_of_runs_section(groups, records),
     )
 
 
@@ -89,7 +106,7 @@ def _curves(groups: Sequence[Group], by: str) -> Html:
         band = "A line of several runs is their interquartile mean, its band the 95 % bootstrap interval."
         if any(len(group.runs) == 1 for group in groups):
             band += " A line of one run has one standard deviation of the newest episodes, and circles for evaluations."
-    return run_sections.section(
+    return section(
         "Learning curves",
         element("p", band, class_="muted"),
         legend(groups) if several else None,
