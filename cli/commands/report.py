@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS, RunRecord, read_record
+from daedalus.analysis.run_groups import Group, select
+from daedalus.analysis.run_report import comparison_page, run_page
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
-from daedalus.cli.comparing.grouping import Group
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
-from daedalus.cli.comparing.selection import select
 from daedalus.cli.logs import print_error, say
-from daedalus.cli.reports.page import comparison_page, run_page
-from daedalus.cli.reports.run_record import RunRecord, read_record
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.regular_files import replace_text
 

@@ -10,18 +10,14 @@ from pathlib import Path
 
 import tomli_w
 
+from daedalus.analysis.sweep_execution import Display, RunProcesses, Sweep, report
+from daedalus.analysis.sweep_plan import Axis, Choices, Planner, read_axis
+from daedalus.analysis.sweep_search import INSTALL, GridSearch, SampledSearch, Search, import_optuna
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.logs import configure_logging, print_error, say
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
 from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
-from daedalus.cli.sweeping.axes import Axis, Choices, read_axis
-from daedalus.cli.sweeping.display import Display
-from daedalus.cli.sweeping.plan import Planner
-from daedalus.cli.sweeping.processes import RunProcesses
-from daedalus.cli.sweeping.report import report
-from daedalus.cli.sweeping.searches import INSTALL, GridSearch, SampledSearch, Search, import_optuna
-from daedalus.cli.sweeping.sweep import Sweep
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError

@@ -20,11 +20,10 @@ from processes import Running, processes_mentioning, until
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
+from daedalus.analysis.recorded_run import read_record, read_run
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate import main
-from daedalus.cli.comparing.recorded_run import read_run
 from daedalus.cli.evaluation_processes import EvaluationFailedError
-from daedalus.cli.reports.run_record import read_record
 from daedalus.cli.run_report import report as report_of
 from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.running.final_evaluation import evaluate_run

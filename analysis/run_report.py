@@ -1,0 +1,441 @@
+"""The report of one or more runs: one HTML file that loads nothing and runs nothing."""
+
+import base64
+import json
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from daedalus.analysis.charts import curves, histogram, legend, written
+from daedalus.analysis.comparison import Comparison, cells, compare_groups, header, notes
+from daedalus.analysis.learning_curves import LARGEST
+from daedalus.analysis.markup import Child, Html, element, escape, join, table
+from daedalus.analysis.recorded_run import ENVIRONMENT, RecordedEvaluation, RunRecord, finite, record_command
+from daedalus.analysis.run_groups import Group, text
+from daedalus.analysis.run_results import EpisodeStatistics, episode_statistics, failed_events, failure_counts, together
+from daedalus.learner.run.run_directory import CONFIG
+from daedalus.protocol.texts import without_secrets
+
+MAX_VIDEO_BYTES = 32 << 20
+_MOST_EVENTS = 200
+
+
+def section(title: str, *content: Child) -> Html:
+    """Return a section with a heading."""
+    return element("section", element("h2", title), *content)
+
+
+def tiles(values: Sequence[tuple[str, str, str]]) -> Html:
+    """Return numbers in large type: name, value and an explanation each."""
+    return element(
+        "dl",
+        [
+            element(
+                "div", element("dt", name), element("dd", value, class_="value"), element("dd", more, class_="more")
+            )
+            for name, value, more in values
+        ],
+        class_="tiles",
+    )
+
+
+def summary_tiles(record: RunRecord) -> Html:
+    """Return the numbers that say most about a run."""
+    values = []
+    if record.evaluation is not None:
+        statistics = episode_statistics(record.evaluation)
+        mean, _, _ = statistics.mean
+        more = f"mean ± std of {record.evaluation.episodes:,} {record.evaluation.actions} episodes"
+        values.append(("evaluation", f"{written(mean)} ± {written(statistics.std)}", more))
+        if statistics.interquartile is not None:
+            value, low, high = statistics.interquartile
+            interval = "" if math.isnan(low) else f"95 % interval {_interval(low, high)}"
+            values.append(("interquartile mean", written(value), interval))
+    trained = record.number("episode_return_mean")
+    values.append(("training", written(trained), "mean return of the newest episodes"))
+    budget = record.run.settings.get("training.env_steps")
+    of_budget = f"of {budget:,}" if isinstance(budget, int) else ""
+    values.append(("env_steps", written(record.number("env_steps")), of_budget))
+    seconds = record.number("wall_seconds")
+    rate = record.number("env_steps_per_second")
+    duration = "-" if seconds is None else _duration(seconds)
+    values.append(("duration", duration, f"{written(rate)} env_steps/s" if rate is not None else ""))
+    values.append(("updates", written(record.number("updates")), f"{written(record.number('episodes'))} episodes"))
+    return tiles(values)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def evaluation_section(record: RunRecord) -> Html:
+    """Return the evaluation: a histogram and the statistics of its episodes."""
+    evaluation = record.evaluation
+    if evaluation is None:
+        how = [
+            "No evaluation is recorded. Evaluate the run with: ",
+            element("code", record_command(record.run.directory)),
+        ]
+        return section("Evaluation", element("p", how, class_="note"))
+    statistics = episode_statistics(evaluation)
+    best = "best" if evaluation.best_checkpoint else "newest"
+    played = (
+        f"{evaluation.episodes:,} {evaluation.actions} episodes of the {best} checkpoint, policy version "
+        f"{evaluation.policy_version}, on {evaluation.environment} (backend {evaluation.backend})"
+        + ("" if evaluation.seed is None else f", seed {evaluation.seed}")
+    )
+    numbers = table((), statistics_rows(evaluation, statistics), label="statistics of the evaluation", numeric={1})
+    return section(
+        "Evaluation",
+        element("p", played, class_="muted"),
+        [element("p", note, class_="note") for note in evaluation.notes],
+        element("div", _returns(record, statistics), element("div", numbers, _confirmation(record)), class_="pair"),
+    )
+
+
+def _returns(record: RunRecord, statistics: EpisodeStatistics) -> Html:
+    assert record.evaluation is not None
+    if statistics.interquartile is None:
+        how = "The returns of the episodes are not recorded, so there is no histogram. Evaluate the run again with: "
+        return element("p", how, element("code", record_command(record.run.directory)), class_="note")
+    returns = np.array(record.evaluation.returns)
+    if not (np.abs(returns) < LARGEST).all():
+        return element("p", "The returns are too large for a histogram.", class_="note")
+    marks = [("mean", statistics.mean.value), ("interquartile mean", statistics.interquartile.value)]
+    keys = [element("li", element("span", class_=f"key mark-{index}"), name) for index, (name, _) in enumerate(marks)]
+    chart = histogram("episodes by return", returns, marks=marks, unit="return")
+    return element("div", chart, element("ul", keys, class_="legend"))
+
+
+def statistics_rows(evaluation: RecordedEvaluation, statistics: EpisodeStatistics) -> list[tuple[str, str]]:
+    """Return the statistics of an evaluation as names and values."""
+    mean = statistics.mean
+    rows = [
+        ("mean", written(mean.value)),
+        ("95 % interval of the mean", _interval(mean.low, mean.high)),
+        ("standard deviation", written(statistics.std)),
+    ]
+    if statistics.interquartile is not None:
+        middle = statistics.interquartile
+        rows += [
+            ("interquartile mean", written(middle.value)),
+            ("95 % bootstrap interval", _interval(middle.low, middle.high)),
+            ("median", written(statistics.median)),
+        ]
+    rows += [
+        ("lowest and highest", _interval(evaluation.return_min, evaluation.return_max)),
+        ("mean length (env_steps)", written(evaluation.length_mean)),
+    ]
+    return rows
+
+
+def _interval(low: float, high: float) -> str:
+    return "-" if low != low or high != high else f"{written(low)} to {written(high)}"
+
+
+def _confirmation(record: RunRecord) -> Html | None:
+    """Return the sentence about the episodes that confirm "solved", if there are any."""
+    mean, episodes = (finite(record.confirmation.get(name)) for name in ("return_mean", "episodes"))
+    if mean is None or episodes is None:
+        return None
+    words = (
+        f"Confirmation: mean return {written(mean)} over {written(episodes)} new sampled episodes of the policy at "
+        "which training stopped"
+    )
+    interval = record.confirmation.get("interval")
+    ends = [finite(end) for end in interval] if isinstance(interval, list) else []
+    if len(ends) == 2 and ends[0] is not None and ends[1] is not None:
+        words += f", 95 % interval {_interval(ends[0], ends[1])}"
+    return element("p", f"{words}.", class_="muted")
+
+
+def video_section(record: RunRecord) -> Html | None:
+    """Return the video, embedded, or None without one."""
+    video = record.video
+    if video is None:
+        return None
+    if video.size > MAX_VIDEO_BYTES:
+        words = (
+            f"{video.path.name} has {video.size / 2**20:.0f} MiB, and a report embeds at most "
+            f"{MAX_VIDEO_BYTES >> 20} MiB: record a shorter one with --max-seconds, or a smaller one with --width."
+        )
+        return section("Video", element("p", words, class_="note"))
+    source = f"data:{video.media_type};base64,{base64.b64encode(video.path.read_bytes()).decode()}"
+    name = f"episodes of this run ({video.path.name})"
+    if video.media_type == "image/gif":
+        return section("Video", element("img", src=source, alt=name, class_="video"))
+    return section("Video", element("video", src=source, controls=True, loop=True, muted=True, aria_label=name))
+
+
+def failure_section(record: RunRecord) -> Html:
+    """Return what failed during the run."""
+    counts = failure_counts(record)
+    events = together(failed_events(record.events))
+    content: list[Child] = []
+    if counts:
+        rows = [(each.name, f"{each.count:,}", each.detail) for each in counts]
+        content.append(table(("failure", "count", "detail"), rows, label="failures by kind", numeric={1}))
+    else:
+        content.append(element("p", "Nothing that the run directory records failed."))
+    if not record.events:
+        content.append(element("p", "This run recorded no events: actors and restarts are unknown.", class_="muted"))
+    if events:
+        rows = [
+            (each.first.time, each.first.kind, each.first.actor, each.first.text, f"{each.count:,}") for each in events
+        ]
+        more = len(rows) - _MOST_EVENTS
+        listed = table(
+            ("first at (UTC)", "event", "actor", "what happened", "count"),
+            rows[:_MOST_EVENTS],
+            label="events",
+            numeric={4},
+        )
+        left_out = element("p", f"{more:,} more are in events.jsonl.", class_="muted") if more > 0 else None
+        content.append(element("details", element("summary", f"{len(rows):,} events"), listed, left_out))
+    if record.output:
+        printed = element("pre", record.output, tabindex=0)
+        content.append(element("details", element("summary", "what actors and evaluations printed last"), printed))
+    return section("What failed meanwhile", *content)
+
+
+def settings_section(record: RunRecord) -> Html:
+    """Return all settings of the run, by their sections."""
+    parts: dict[str, list[tuple[str, str]]] = {}
+    for path, value in record.run.settings.items():
+        part, _, name = path.partition(".")
+        if value is not None:
+            parts.setdefault(part, []).append((name, setting_text(value)))
+    columns = [
+        element("div", element("h3", part), table((), rows, label=f"settings: {part}"), class_="card")
+        for part, rows in parts.items()
+        if rows
+    ]
+    return section("Settings", element("div", columns, class_="columns"))
+
+
+def setting_text(value: object) -> str:
+    """Return the value of a setting as text of limited length."""
+    shown = without_secrets(text(value) if not isinstance(value, dict | list) else json.dumps(value))
+    return shown if len(shown) <= 400 else f"{shown[:400]}..."
+
+
+def versions_section(record: RunRecord) -> Html | None:
+    """Return the versions of the packages that the run was started with, or None if they are not recorded."""
+    if not record.versions:
+        return None
+    return section("Versions", table((), record.versions.items(), label="versions"))
+
+
+def repeat_section(record: RunRecord) -> Html:
+    """Return the commands that train and evaluate the same again."""
+    config, directory = (shlex.quote(str(path)) for path in (record.run.directory / CONFIG, record.run.directory))
+    commands = f"daedalus train {config}\ndaedalus evaluate {directory}"
+    return section("Do it again", element("pre", commands, tabindex=0))
+
+
+Records = Mapping[Path, RunRecord]  # by run directory
+
+
+def comparison_of(groups: Sequence[Group], threshold: float | None) -> Comparison | None:
+    """Return the comparison of the finished runs, or None if no run has finished."""
+    finished = [replace(group, runs=[run for run in group.runs if not run.unfinished]) for group in groups]
+    finished = [group for group in finished if group.runs]
+    return compare_groups(finished, threshold) if finished else None
+
+
+def comparison_section(comparison: Comparison | None) -> Html:
+    """Return the table of the groups, with intervals."""
+    if comparison is None:
+        return section(
+            "Comparison", element("p", "No run has finished, so there is nothing to compare yet.", class_="note")
+        )
+    rows = [cells(result, comparison) for result in comparison.results]
+    explained = [element("li", line) for line in notes(comparison)]
+    return section(
+        "Comparison",
+        table(header(comparison), rows, label="comparison of the groups", numeric=range(1, 7)),
+        element("ul", explained, class_="muted"),
+    )
+
+
+def runs_section(groups: Sequence[Group], records: Records) -> Html:
+    """Return the table of the runs."""
+    head = ("run", "group", "seed", "status", "env_steps", "minutes", "training", "evaluation", "failures")
+    rows = []
+    for group in groups:
+        for run in group.runs:
+            record = records[run.directory]
+            seconds = record.number("wall_seconds")
+            failures = ", ".join(f"{each.name}: {each.count:,}" for each in failure_counts(record))
+            rows.append(
+                (
+                    record.name,
+                    group.name,
+                    text(run.settings.get("training.seed")),
+                    record.status,
+                    written(record.number("env_steps")),
+                    written(None if seconds is None else seconds / 60.0),
+                    written(record.number("episode_return_mean")),
+                    _evaluated(record),
+                    failures or "none",
+                )
+            )
+    return section("Runs", table(head, rows, label="runs", numeric=(2, 4, 5, 6, 7)))
+
+
+def _evaluated(record: RunRecord) -> str:
+    if record.evaluation is None:
+        return written(record.number("evaluation_return_mean"))
+    return f"{written(record.evaluation.return_mean)} ± {written(record.evaluation.return_std)}"
+
+
+def differences_section(groups: Sequence[Group]) -> Html | None:
+    """Return the settings in which the groups differ, or None if there are none."""
+    known = sorted({key for group in groups for run in group.runs for key in run.settings} - {"training.seed"})
+    rows = [(key, *(_values(group, key) for group in groups)) for key in known]
+    rows = [row for row in rows if len(set(row[1:])) > 1]
+    if not rows:
+        return None
+    head = ("setting", *(group.name for group in groups))
+    return section("Settings that differ", table(head, rows, label="settings that differ"))
+
+
+def _values(group: Group, key: str) -> str:
+    return " / ".join(sorted({setting_text(run.settings.get(key)) for run in group.runs}))
+
+
+def versions_of_runs_section(groups: Sequence[Group], records: Records) -> Html | None:
+    """Return the versions of the packages, one column for each set of versions that runs were started with."""
+    columns: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    for group in groups:
+        for run in group.runs:
+            record = records[run.directory]
+            shown = {name: value for name, value in record.versions.items() if not name.startswith("init_from")}
+            if shown:
+                columns.setdefault(tuple(sorted(shown.items())), []).append(record.name)
+    if not columns:
+        return None
+    names = list(dict.fromkeys(name for versions in columns for name, _ in versions))
+    rows = [(name, *(dict(versions).get(name, "-") for versions in columns)) for name in names]
+    heads = [runs[0] if len(runs) == 1 else f"{runs[0]} and {len(runs) - 1} more" for runs in columns.values()]
+    head = ("package", *heads) if len(columns) > 1 else ()
+    return section("Versions", table(head, rows, label="versions"))
+
+
+_STYLE = Path(__file__).with_name("report_style.css")
+# The browser itself enforces that the page loads nothing from elsewhere and runs no script.
+_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; base-uri 'none'; form-action 'none'"
+)
+
+
+def run_page(record: RunRecord, group: Group, by: str) -> str:
+    """Return the report of one run.
+
+    Args:
+      record: the run.
+      group: the run alone, with the name that the curves have.
+      by: horizontal axis of the curves, "env_steps" or "minutes".
+    """
+    settings = record.run.settings
+    facts = [
+        settings.get(ENVIRONMENT),
+        settings.get("training.algorithm"),
+        *(f"{name} {settings[key]}" for name, key in (("seed", "training.seed"),) if settings.get(key) is not None),
+        *(f"{settings[key]} actors" for key in ("collection.actors",) if settings.get(key) is not None),
+    ]
+    unfinished = record.run.unfinished
+    return _document(
+        record.name,
+        _header(record.name, facts, record.status),
+        element("p", unfinished, class_="note") if unfinished else None,
+        summary_tiles(record),
+        _curves([group], by),
+        evaluation_section(record),
+        video_section(record),
+        failure_section(record),
+        settings_section(record),
+        versions_section(record),
+        repeat_section(record),
+    )
+
+
+def comparison_page(
+    groups: Sequence[Group],
+    records: Records,
+    by: str,
+    *,
+    threshold: float | None,
+    left_out: Sequence[str],
+) -> str:
+    """Return the report of several runs.
+
+    Args:
+      groups: the runs, one curve for each group.
+      records: the runs by their directories.
+      by: horizontal axis of the curves, "env_steps" or "minutes".
+      threshold: mean return to reach, for the table (default: the target return of the runs).
+      left_out: one line for each run that could not be read.
+    """
+    runs = [run for group in groups for run in group.runs]
+    comparison = comparison_of(groups, threshold)
+    environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
+    title = f"{len(runs)} runs of {environment}" if environment else f"{len(runs)} runs"
+    unfinished = [run.unfinished for run in runs if run.unfinished]
+    return _document(
+        title,
+        _header(title, [f"{len(groups)} groups" if len(groups) > 1 else "1 group"], None),
+        [element("p", line, class_="note") for line in [*left_out, *unfinished]],
+        comparison_section(comparison),
+        _curves(groups, by),
+        runs_section(groups, records),
+        differences_section(groups),
+        versions_of_runs_section(groups, records),
+    )
+
+
+def _curves(groups: Sequence[Group], by: str) -> Html:
+    several = len(groups) > 1 or len(groups[0].runs) > 1
+    band = "The band is one standard deviation of the newest episodes, circles are evaluations."
+    if several:
+        band = "A line of several runs is their interquartile mean, its band the 95 % bootstrap interval."
+        if any(len(group.runs) == 1 for group in groups):
+            band += " A line of one run has one standard deviation of the newest episodes, and circles for evaluations."
+    return section(
+        "Learning curves",
+        element("p", band, class_="muted"),
+        legend(groups) if several else None,
+        element("div", curves(groups, by), class_="charts"),
+    )
+
+
+def _header(title: str, facts: Sequence[object], status: str | None) -> Html:
+    known = " · ".join(str(fact) for fact in facts if fact not in (None, ""))
+    chip = element("span", status, class_="status", data_status=status) if status else None
+    return element(
+        "header",
+        element("div", element("h1", title), chip, class_="bar"),
+        element("p", known, class_="muted"),
+    )
+
+
+def _document(title: str, header: Html, *content: Child) -> str:
+    style = Html(_STYLE.read_text("utf-8"))
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        Html(f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY)}">'),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
+        element("title", f"{title}: report of daedalus"),
+        element("style", style),
+    )
+    footer = element("footer", "made by ", element("code", "daedalus report"))
+    body = element("body", header, element("main", join(content)), footer)
+    return f"<!doctype html>\n{element('html', head, body, lang='en')}\n"
