@@ -69,7 +69,7 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
     targets = {run.target for run in runs}
     if threshold is None and len(targets) == 1:
         threshold = targets.pop()
-    evaluated = all(run.evaluation is not None for run in runs)
+    evaluated = all(run.evaluation_return is not None for run in runs)
     other_task = not all(run.trains_true_task for run in runs)
     returns = [final_returns(group, evaluated=evaluated) for group in groups]
     if problem := incomparable_returns(groups):
@@ -118,7 +118,7 @@ def training_tasks(groups: Sequence[Group]) -> set[str]:
 def incomparable_returns(groups: Sequence[Group]) -> str:
     """Return why final returns cannot be compared: some are of training, on different tasks. Else an empty string."""
     runs = [run for group in groups for run in group.runs]
-    without = [run for run in runs if run.evaluation is None]
+    without = [run for run in runs if run.evaluation_return is None]
     if not without or len(training_tasks(groups)) < 2:
         return ""
     return (
@@ -130,7 +130,7 @@ def incomparable_returns(groups: Sequence[Group]) -> str:
 
 def final_returns(group: Group, *, evaluated: bool) -> np.ndarray:
     """Return the final return of each run, [runs]: of its final evaluation, or of its last training episodes."""
-    values = [run.evaluation if evaluated else run.training_return for run in group.runs]
+    values = [run.evaluation_return if evaluated else run.training_return for run in group.runs]
     return np.array([math.nan if value is None else value for value in values])
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.analysis.model_card import model_card
-from daedalus.analysis.recorded_run import SECONDS, RunRecord, one_run, read_record, read_run, record_command
+from daedalus.analysis.recorded_run import SECONDS, RunRecord, one_run, read_record, record_command
 from daedalus.learner.reporting.trackers.tracker import flat
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, METRICS, VERSIONS
 from daedalus.learner.run.run_files import RunDataError
@@ -40,7 +40,7 @@ def push(directory: Path, repository: str, *, private: bool) -> str:
     """
     api = hub_api()  # first: without the library, nothing can be done
     check_repository(repository)
-    record = read_record(read_run(one_run(directory), [SECONDS]))
+    record = read_record(one_run(directory), [SECONDS])
     policy = find_policy(directory)
     record = _with_matching_evaluation(record, policy)
     if api.token is None:
@@ -90,7 +90,7 @@ def policy_files(record: RunRecord, policy: SavedPolicy, repository: str) -> dic
     elif record.video is not None:
         video = f"{REPLAY}{record.video.path.suffix.lower()}"  # the name that the Hub shows on the page
         files[video] = record.video.path.read_bytes()
-    files |= _texts(record.run.directory, (CONFIG, METRICS))
+    files |= _texts(record.directory, (CONFIG, METRICS))
     if record.evaluation is not None:
         files[EVALUATION] = _json(record.evaluation.model_dump(mode="json"))
     own = {name: value for name, value in record.versions.items() if not name.startswith("init_from")}  # a path
@@ -119,7 +119,7 @@ def _texts(directory: Path, names: Iterable[str]) -> dict[str, bytes]:
 
 def _with_matching_evaluation(record: RunRecord, policy: SavedPolicy) -> RunRecord:
     """Return the record, without the evaluation of another policy of the run."""
-    evaluation, how = record.evaluation, record_command(record.run.directory)
+    evaluation, how = record.evaluation, record_command(record.directory)
     if evaluation is None:
         _logger.warning("no evaluation is recorded, and the model card has no results; before the push: %s", how)
     elif evaluation.policy_version != policy.policy_version:

@@ -9,6 +9,8 @@ from daedalus.analysis.recorded_run import ENV_STEPS, RETURN, SECONDS, RecordedR
 from daedalus.analysis.run_groups import Group
 from daedalus.analysis.statistics import interquartile_interval, interquartile_mean
 
+STD = "episode_return_std"
+LARGEST = 1e100  # larger numbers are left out: their distances overflow
 _POINTS = 200
 
 
@@ -24,25 +26,30 @@ class Series:
     marks: tuple[np.ndarray, np.ndarray] | None = None  # single points, such as evaluations: where they lie, values
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Curve:
-    """A column of the metrics over env_steps or minutes, [points] each."""
+def series_of(group: Group, column: str, by: str) -> Series | None:
+    """Return the line of a group, or None if a run of it has no values.
 
-    x: np.ndarray
-    mean: np.ndarray  # interquartile mean over the runs
-    low: np.ndarray  # of the 95 % interval; NaN for a single run
-    high: np.ndarray
+    The line of several runs is their interquartile mean with its 95 % interval; the return of one run has the standard
+    deviation of its episodes and its evaluations.
+
+    Args:
+      group: the runs.
+      column: column of their metrics.
+      by: "env_steps" or "minutes".
+    """
+    if not all(column in run.metrics for run in group.runs):
+        return None
+    if len(group.runs) > 1:
+        series = _group_series(group.name, group.runs, column, by)
+    else:
+        series = _run_series(group.name, group.runs[0], column, by)
+    return None if series is None else _drawable(series)
 
 
 def points(run: RecordedRun, column: str, by: str) -> tuple[np.ndarray, np.ndarray]:
     """Return where the known values of a column lie, [rows], increasing, and the values, [rows].
 
-    Of several values at the same place, the newest counts.
-
-    Args:
-      run: the run.
-      column: column of its metrics.
-      by: "env_steps" or "minutes".
+    Of several values at the same place, the newest counts. Args: as of `series_of`.
     """
     x = run.metrics[ENV_STEPS] if by == ENV_STEPS else run.metrics[SECONDS] / 60.0
     y = run.metrics[column]
@@ -50,29 +57,6 @@ def points(run: RecordedRun, column: str, by: str) -> tuple[np.ndarray, np.ndarr
     x, y = x[known], y[known]
     newest = x < np.append(x[1:], np.inf)
     return x[newest], y[newest]
-
-
-def group_curve(runs: Sequence[RecordedRun], column: str, by: str) -> Curve | None:
-    """Return the curve of the interquartile mean over runs, or None if a run has no value.
-
-    It begins where all runs have a value. A finished run keeps its last value, because runs that reach their target end
-    early; the curve ends where the first unfinished run ends.
-
-    Args: as of `points`.
-    """
-    lines = [points(run, column, by) for run in runs]
-    if any(len(x) == 0 for x, _ in lines):
-        return None
-    begin = max(x[0] for x, _ in lines)
-    last = [x[-1] for x, _ in lines]
-    running = [end for end, run in zip(last, runs, strict=True) if run.unfinished]
-    end = min([max(last), *running])
-    if end < begin:
-        return None
-    grid = np.linspace(begin, end, _POINTS)
-    values = np.stack([np.interp(grid, x, y) for x, y in lines])  # [runs, points]
-    interval = interquartile_interval([values])
-    return Curve(x=grid, mean=interquartile_mean(values, 0), low=interval.low, high=interval.high)
 
 
 def evaluations(run: RecordedRun, by: str) -> tuple[np.ndarray, np.ndarray]:
@@ -89,28 +73,32 @@ def evaluations(run: RecordedRun, by: str) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-_STD = "episode_return_std"
-LARGEST = 1e100  # larger numbers are left out: their distances overflow
+def _group_series(name: str, runs: Sequence[RecordedRun], column: str, by: str) -> Series | None:
+    """Return the interquartile mean of runs, or None if a run has no value.
 
-
-def series_of(group: Group, column: str, by: str) -> Series | None:
-    """Return the line of a group, or None if a run of it has no values."""
-    if not all(column in run.metrics for run in group.runs):
+    It begins where all runs have a value. A finished run keeps its last value, because runs that reach their target end
+    early; the line ends where the first unfinished run ends.
+    """
+    lines = [points(run, column, by) for run in runs]
+    if any(len(x) == 0 for x, _ in lines):
         return None
-    if len(group.runs) > 1:
-        curve = group_curve(group.runs, column, by)
-        if curve is None:
-            return None
-        return _drawable(Series(name=group.name, x=curve.x, y=curve.mean, low=curve.low, high=curve.high))
-    return _drawable(_run_series(group.name, group.runs[0], column, by))
+    begin = max(x[0] for x, _ in lines)
+    last = [x[-1] for x, _ in lines]
+    running = [end for end, run in zip(last, runs, strict=True) if run.unfinished]
+    end = min([max(last), *running])
+    if end < begin:
+        return None
+    grid = np.linspace(begin, end, _POINTS)
+    values = np.stack([np.interp(grid, x, y) for x, y in lines])  # [runs, points]
+    interval = interquartile_interval([values])
+    return Series(name=name, x=grid, y=interquartile_mean(values, 0), low=interval.low, high=interval.high)
 
 
 def _run_series(name: str, run: RecordedRun, column: str, by: str) -> Series:
-    """Return the line of one run; that of the return with its standard deviation and the evaluations."""
     x, y = points(run, column, by)
-    if column != RETURN or _STD not in run.metrics:
+    if column != RETURN or STD not in run.metrics:
         return Series(name=name, x=x, y=y)
-    std_x, std = points(run, _STD, by)
+    std_x, std = points(run, STD, by)
     spread = np.interp(x, std_x, std) if len(std) else np.zeros(len(x))
     at, values = evaluations(run, by)
     known = (np.abs(values) < LARGEST) & (np.abs(at) < LARGEST)

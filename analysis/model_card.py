@@ -9,10 +9,8 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-from daedalus.analysis.charts import written
 from daedalus.analysis.recorded_run import ENVIRONMENT, RecordedEvaluation, RunRecord
-from daedalus.analysis.run_report import setting_text, statistics_rows
-from daedalus.analysis.run_results import episode_statistics, failure_counts
+from daedalus.analysis.run_results import episode_statistics, failure_counts, setting_text, statistics_rows, written
 from daedalus.policy.saving.hub import LIBRARY
 from daedalus.policy.user_modules import allow_words, modules_of
 from daedalus.protocol.spec import RunSpec
@@ -153,7 +151,7 @@ def _training(record: RunRecord, spec: RunSpec) -> str:
 def _settings(record: RunRecord) -> str:
     rows = [
         (path, setting_text(value))
-        for path, value in record.run.settings.items()
+        for path, value in record.settings.items()
         if value is not None and path.partition(".")[0] in _SHOWN_SECTIONS and path != ENVIRONMENT
     ]
     if not rows:

@@ -37,6 +37,8 @@ _NUMBERS = {"training.env_steps", "training.target_return", "training.target_epi
 _SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
 _LARGEST = 1e300
 _MAX_METRICS_BYTES = 2 << 30  # a month of rows at the default log interval
+_MAX_OUTPUT_BYTES = 16 << 10
+_VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,7 +71,7 @@ class RecordedRun:
         """Why the run has no result yet, or an empty string."""
         done = self.metrics[ENV_STEPS][-1]
         budget = self.settings.get("training.env_steps", math.nan)
-        ended = self.summary.get("finished") or self.evaluation is not None
+        ended = self.summary.get("finished") or self.evaluation_return is not None
         # A run that was resumed with a larger budget has made more steps than its summary says.
         steps = self.summary.get("env_steps")
         if ended and (steps is None or done <= steps):
@@ -80,7 +82,7 @@ class RecordedRun:
         return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
 
     @property
-    def evaluation(self) -> float | None:
+    def evaluation_return(self) -> float | None:
         """Mean return of the final evaluation, or None without one."""
         return self.summary.get("evaluation_return_mean")
 
@@ -269,10 +271,6 @@ def _numbers(path: Path, line: int, row: Sequence[str], cells: int) -> list[floa
         raise RunDataError(f"{path} is damaged: line {line}: {error}") from None
 
 
-_MAX_OUTPUT_BYTES = 16 << 10
-_VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
-
-
 class RecordedEvaluation(BaseModel, allow_inf_nan=False, frozen=True):
     """Result of `daedalus evaluate --json`. Without the returns of the episodes in runs of earlier releases."""
 
@@ -302,10 +300,9 @@ class Video:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RunRecord:
-    """What the directory of one run records."""
+class RunRecord(RecordedRun):
+    """All that the directory of a run records, for a report."""
 
-    run: RecordedRun
     evaluation: RecordedEvaluation | None  # the last recorded one
     confirmation: Mapping[str, Any]  # of summary.json; empty without one
     versions: Mapping[str, str]
@@ -316,36 +313,36 @@ class RunRecord:
     @property
     def name(self) -> str:
         """Name of the run."""
-        return self.run.directory.resolve().name
+        return self.directory.resolve().name
 
     @property
     def status(self) -> str:
         """How the run ended, in one word or two."""
-        if self.run.unfinished:
+        if self.unfinished:
             return "not finished"
-        return "solved" if self.run.summary.get("solved") else "finished"
+        return "solved" if self.summary.get("solved") else "finished"
 
     @property
     def rejected(self) -> dict[str, int]:
         """Rejected rollouts of a run that has a summary, by cause."""
-        causes = self.run.summary.get("rollouts_rejected")
+        causes = self.summary.get("rollouts_rejected")
         if not isinstance(causes, dict):
             return {}
         return {cause: count for cause, count in causes.items() if isinstance(count, int) and count > 0}
 
     def number(self, name: str) -> float | None:
         """Return a finite number of summary.json, or else the last one of the column of metrics.csv, or None."""
-        value = finite(self.run.summary.get(name))
-        if value is not None or name not in self.run.metrics:
+        value = finite(self.summary.get(name))
+        if value is not None or name not in self.metrics:
             return value
-        column = self.run.metrics[name]
+        column = self.metrics[name]
         known = column[np.isfinite(column)]
         return float(known[-1]) if len(known) else None
 
 
-def read_record(run: RecordedRun) -> RunRecord:
-    """Return what the directory of a run records. Raises RunDataError."""
-    directory = run.directory
+def read_record(directory: Path, columns: Sequence[str] = ()) -> RunRecord:
+    """Return all that a directory records of a run. See `read_run`. Raises RunDataError."""
+    run = read_run(directory, columns)
     try:
         events = list(read_events(directory))
     except OSError as error:
@@ -353,8 +350,11 @@ def read_record(run: RecordedRun) -> RunRecord:
     confirmation = run.summary.get("confirmation")
     versions = read_json(directory / VERSIONS) or {}
     return RunRecord(
-        run=run,
-        evaluation=_evaluation(directory, run),
+        directory=directory,
+        settings=run.settings,
+        metrics=run.metrics,
+        summary=run.summary,
+        evaluation=_evaluation(run),
         confirmation=confirmation if isinstance(confirmation, dict) else {},
         versions={name: str(value) for name, value in versions.items() if value is not None},
         events=events,
@@ -372,8 +372,9 @@ def finite(value: Any) -> float | None:
     return None
 
 
-def _evaluation(directory: Path, run: RecordedRun) -> RecordedEvaluation | None:
-    content = read_json(directory / EVALUATION) or run.summary.get("evaluation")
+def _evaluation(run: RecordedRun) -> RecordedEvaluation | None:
+    path = run.directory / EVALUATION
+    content = read_json(path) or run.summary.get("evaluation")
     if not content:
         return None
     try:
@@ -382,8 +383,7 @@ def _evaluation(directory: Path, run: RecordedRun) -> RecordedEvaluation | None:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise RunDataError(
-            f"{directory / EVALUATION} is damaged ({where}: {first['msg']}): write it again with: "
-            f"{record_command(directory)}"
+            f"{path} is damaged ({where}: {first['msg']}): write it again with: {record_command(run.directory)}"
         ) from None
 
 

@@ -2,10 +2,10 @@
 
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from daedalus.analysis.recorded_run import ENVIRONMENT, SEED, RecordedRun, find_runs, read_run
 from daedalus.learner.run.run_files import RunDataError
@@ -18,12 +18,15 @@ _MOST_NAMED = 4  # settings in the name of a group, if they are enough
 _LONGEST_VALUE = 24  # characters of a value in a name, if different values stay different
 
 
+Run = TypeVar("Run", bound=RecordedRun)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Group:
+class Group(Generic[Run]):
     """Runs that differ in their seed only, or that the user put together."""
 
     name: str
-    runs: Sequence[RecordedRun]
+    runs: Sequence[Run]
     unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in the name
 
 
@@ -41,14 +44,14 @@ def check_comparable(runs: Sequence[RecordedRun]) -> None:
         )
 
 
-def by_settings(runs: Sequence[RecordedRun], keys: Sequence[str] = ()) -> list[Group]:
+def by_settings(runs: Sequence[Run], keys: Sequence[str] = ()) -> list[Group[Run]]:
     """Return the runs as groups of equal settings, sorted by the settings that differ.
 
     Args:
       runs: the runs; one without settings is a group of its own.
       keys: settings that name the groups (default: those in which the groups differ).
     """
-    parts: dict[str, list[RecordedRun]] = {}
+    parts: dict[str, list[Run]] = {}
     for run in runs:
         parts.setdefault(_identity(run, keys), []).append(run)
     groups = list(parts.values())
@@ -59,7 +62,7 @@ def by_settings(runs: Sequence[RecordedRun], keys: Sequence[str] = ()) -> list[G
     return _named(groups, differing, keys)
 
 
-def by_user(parts: Sequence[Sequence[RecordedRun]]) -> list[Group]:
+def by_user(parts: Sequence[Sequence[Run]]) -> list[Group[Run]]:
     """Return groups that a user put together, in their order, named by the settings that differ, if any do."""
     return _named(parts, _differing(parts))
 
@@ -100,9 +103,7 @@ def _parts(key: str, runs: Sequence[RecordedRun]) -> list[str]:
     return [f"{key}.{name}" for name in names]
 
 
-def _named(
-    groups: Sequence[Sequence[RecordedRun]], differing: Sequence[str], chosen: Sequence[str] = ()
-) -> list[Group]:
+def _named(groups: Sequence[Sequence[Run]], differing: Sequence[str], chosen: Sequence[str] = ()) -> list[Group[Run]]:
     """Return groups with names: of the chosen settings, or else of the first of those that differ."""
     names, keys = [""] * len(groups), list[str]()
     for tried in [chosen] if chosen else (differing[:_MOST_NAMED], differing):
@@ -170,7 +171,8 @@ def select(
     finished: bool,
     columns: Sequence[str] = (),
     keys: Sequence[str] = (),
-) -> tuple[list[Group], list[str]]:
+    read: Callable[[Path, Sequence[str]], Run] = read_run,
+) -> tuple[list[Group[Run]], list[str]]:
     """Return the groups of the runs that paths name, and one line for each run that is left out.
 
     Args:
@@ -178,30 +180,26 @@ def select(
       finished: leave out unfinished runs.
       columns: columns of the metrics that are needed.
       keys: settings that name the groups, if there is one part (default: those that differ).
+      read: reads a run directory: `read_run`, or `read_record` for all that it records.
 
     Raises RunDataError if a path is no run directory, no run is left, or the runs play different environments.
     """
     problems: list[str] = []
-    read = [_usable(find_runs(part), finished, columns, problems) for part in parts]
-    if not all(read):
-        raise RunDataError("; ".join(problems[:1]))
-    check_comparable([run for part in read for run in part])
-    groups = by_settings(read[0], keys) if len(read) == 1 else by_user(read)
-    return groups, [f"left out: {problem}" for problem in problems]
 
-
-def _usable(
-    directories: Sequence[Path], finished: bool, columns: Sequence[str], problems: list[str]
-) -> list[RecordedRun]:
-    usable = []
-    for directory in directories:
+    def usable(directory: Path) -> Run | None:
         try:
-            run = read_run(directory, columns)
+            run = read(directory, columns)
         except RunDataError as error:
             problems.append(str(error))
-            continue
+            return None
         if finished and run.unfinished:
             problems.append(run.unfinished)
-        else:
-            usable.append(run)
-    return usable
+            return None
+        return run
+
+    runs = [[run for run in map(usable, find_runs(part)) if run is not None] for part in parts]
+    if not all(runs):
+        raise RunDataError("; ".join(problems[:1]))
+    check_comparable([run for part in runs for run in part])
+    groups = by_settings(runs[0], keys) if len(runs) == 1 else by_user(runs)
+    return groups, [f"left out: {problem}" for problem in problems]

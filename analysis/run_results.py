@@ -1,5 +1,6 @@
-"""Results of one run: statistics of its evaluation, and what failed. Pure functions."""
+"""Results of one run, as a report and a model card show them: its evaluation, and what failed. Pure functions."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +9,10 @@ import numpy as np
 
 from daedalus.analysis.comparison import Estimate
 from daedalus.analysis.recorded_run import RecordedEvaluation, RunRecord
+from daedalus.analysis.run_groups import text
 from daedalus.analysis.statistics import interquartile_mean, mean_interval, stratified_bootstrap
 from daedalus.learner.run.event_file import RESTARTED, RESUMED, RecordedEvent
+from daedalus.protocol.texts import short_number, without_secrets
 
 _REPETITIONS = 2000
 _MOST_VALUES = 4_000_000  # that the bootstrap draws in all, to limit its memory and its time
@@ -131,3 +134,44 @@ def _share(record: RunRecord, rejected: int, causes: str) -> str:
         return causes
     share = f"{100 * rejected / (rejected + accepted):.2g} % of all"
     return f"{share}: {causes}" if causes else share
+
+
+def statistics_rows(evaluation: RecordedEvaluation, statistics: EpisodeStatistics) -> list[tuple[str, str]]:
+    """Return the statistics of an evaluation as names and values."""
+    mean = statistics.mean
+    rows = [
+        ("mean", written(mean.value)),
+        ("95 % interval of the mean", interval_text(mean.low, mean.high)),
+        ("standard deviation", written(statistics.std)),
+    ]
+    if statistics.interquartile is not None:
+        middle = statistics.interquartile
+        rows += [
+            ("interquartile mean", written(middle.value)),
+            ("95 % bootstrap interval", interval_text(middle.low, middle.high)),
+            ("median", written(statistics.median)),
+        ]
+    rows += [
+        ("lowest and highest", interval_text(evaluation.return_min, evaluation.return_max)),
+        ("mean length (env_steps)", written(evaluation.length_mean)),
+    ]
+    return rows
+
+
+def interval_text(low: float, high: float) -> str:
+    """Return the ends of an interval as a text; `-` if they are unknown."""
+    return "-" if low != low or high != high else f"{written(low)} to {written(high)}"
+
+
+def setting_text(value: object) -> str:
+    """Return the value of a setting as text of limited length."""
+    shown = without_secrets(text(value) if not isinstance(value, dict | list) else json.dumps(value))
+    return shown if len(shown) <= 400 else f"{shown[:400]}..."
+
+
+def written(value: float | None) -> str:
+    """Return a number for a text or a table cell, whole ones without a point; `-` for None and NaN."""
+    if value is None or math.isnan(value):
+        return "-"
+    whole = 10 <= abs(value) < 1e15 and float(value).is_integer()
+    return f"{value:,.0f}" if whole else short_number(value)

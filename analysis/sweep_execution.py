@@ -381,4 +381,4 @@ def _result(run: PlannedRun, end: SweepEnd) -> list[object]:
         return [str(error), "", "", "", ""]
     summary = recorded.summary
     minutes = summary.get("wall_seconds", 0.0) / 60.0
-    return ["done", recorded.evaluation, summary.get("env_steps"), minutes, summary.get("solved")]
+    return ["done", recorded.evaluation_return, summary.get("env_steps"), minutes, summary.get("solved")]

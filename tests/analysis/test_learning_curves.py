@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from recorded_runs import record
 
-from daedalus.analysis.learning_curves import evaluations, group_curve, points
+from daedalus.analysis.learning_curves import Series, evaluations, points, series_of
 from daedalus.analysis.recorded_run import RETURN, RecordedRun, read_run
+from daedalus.analysis.run_groups import Group
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.run.run_directory import METRICS
@@ -16,6 +17,10 @@ from daedalus.learner.run.run_directory import METRICS
 
 def run(folder: Path, name: str, **content: Any) -> RecordedRun:
     return read_run(record(folder / name, **content))
+
+
+def group_curve(*runs: RecordedRun) -> Series | None:
+    return series_of(Group(name="group", runs=runs), RETURN, "env_steps")
 
 
 def test_rows_without_a_value_are_left_out(tmp_path: Path) -> None:
@@ -36,37 +41,37 @@ def test_the_curve_is_the_interquartile_mean_at_each_place(tmp_path: Path) -> No
         run(tmp_path, f"s{seed}", seed=seed, returns=(value, 3.0 * value), env_steps=(0, 100))
         for seed, value in enumerate((-50.0, 1.0, 3.0, 90.0))
     ]
-    curve = group_curve(runs, RETURN, "env_steps")
+    curve = group_curve(*runs)
     assert curve is not None
-    np.testing.assert_allclose(curve.mean, 2.0 + 4.0 * curve.x / 100.0)
-    assert np.all(curve.low <= curve.mean)
-    assert np.all(curve.mean <= curve.high)
+    assert curve.low is not None
+    assert curve.high is not None
+    np.testing.assert_allclose(curve.y, 2.0 + 4.0 * curve.x / 100.0)
+    assert np.all(curve.low <= curve.y)
+    assert np.all(curve.y <= curve.high)
     assert curve.low[-1] < -1.0
 
 
 def test_a_finished_run_keeps_its_last_value(tmp_path: Path) -> None:
     short = run(tmp_path, "a", returns=(0.0, 10.0), env_steps=(0, 100))
     long = run(tmp_path, "b", returns=(0.0, 20.0), env_steps=(0, 200))
-    curve = group_curve([short, long], RETURN, "env_steps")
+    curve = group_curve(short, long)
     assert curve is not None
     assert curve.x[-1] == 200.0
-    assert curve.mean[-1] == 15.0
+    assert curve.y[-1] == 15.0
 
 
 def test_the_curve_ends_where_an_unfinished_run_ends(tmp_path: Path) -> None:
     running = run(tmp_path, "a", returns=(0.0, 10.0), env_steps=(0, 100), finished=False, evaluation=None)
-    curve = group_curve([running, run(tmp_path, "b")], RETURN, "env_steps")
+    curve = group_curve(running, run(tmp_path, "b"))
     assert curve is None  # the other one has its first value at 1,000
-    curve = group_curve([running, run(tmp_path, "c", returns=(0.0, 8.0), env_steps=(0, 200))], RETURN, "env_steps")
+    curve = group_curve(running, run(tmp_path, "c", returns=(0.0, 8.0), env_steps=(0, 200)))
     assert curve is not None
     assert curve.x[-1] == 100.0
-    assert curve.mean[-1] == 7.0
+    assert curve.y[-1] == 7.0
 
 
 def test_a_run_without_a_value_has_no_curve(tmp_path: Path) -> None:
-    assert (
-        group_curve([run(tmp_path, "a", returns=(None, None, None)), run(tmp_path, "b")], RETURN, "env_steps") is None
-    )
+    assert group_curve(run(tmp_path, "a", returns=(None, None, None)), run(tmp_path, "b")) is None
 
 
 def test_evaluations_of_an_undone_part_are_left_out_and_the_others_run_forwards(tmp_path: Path) -> None:

@@ -63,7 +63,11 @@ def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
 @pytest.mark.parametrize("index", range(3))
 def test_the_page_shows_what_it_has_without_network(reports: list[Path], opened: Any, index: int) -> None:
     page = opened(reports[index])
-    assert page.locator("svg .line").count() >= 4
+    assert page.locator("figure svg").count() >= 4
+    text = page.locator("figure svg text").first
+    assert text.evaluate("each => getComputedStyle(each).fill") == text.evaluate(
+        "each => getComputedStyle(document.querySelector('footer')).color"
+    )
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     page.set_viewport_size({"width": 360, "height": 740})
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
