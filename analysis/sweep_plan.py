@@ -1,16 +1,13 @@
 """The runs of a sweep: the settings that vary, and the names and directories of its runs. No processes."""
 
-import argparse
-import copy
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.settings_arguments import resolve_spec
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, read_value
 from daedalus.policy.user_modules import allow_settings
@@ -133,11 +130,17 @@ class PlannedRun:
 
 
 class Planner:
-    """Planner of runs in one folder, from the options that `daedalus sweep` shares with `daedalus train`."""
+    """Planner of runs in one folder."""
 
-    def __init__(self, parsed: argparse.Namespace, folder: Path, defaults: dict[str, Any] | None = None) -> None:
-        """Construct the planner. See settings_arguments.resolve for `defaults`."""
-        self._parsed, self._folder, self._defaults = parsed, folder, defaults
+    def __init__(self, folder: Path, settings: Callable[[Point, int], tuple[RunSpec, Sequence[str]]]) -> None:
+        """Construct the planner.
+
+        Args:
+          folder: of the sweep.
+          settings: returns the settings of a run, from its point and seed, and the words of the command line that
+            starts it, after `daedalus`. May raise SettingsError.
+        """
+        self._folder, self._settings = folder, settings
 
     def runs(self, name: str, point: Point, seeds: Sequence[int]) -> list[PlannedRun]:
         """Return the runs of a point, one for each seed.
@@ -146,32 +149,14 @@ class Planner:
         """
         runs = []
         for seed in seeds:
-            options = _with_point(self._parsed, point, seed)
             own = f"{name}_seed-{seed}" if name else f"seed-{seed}"
             directory = self._folder / own
-            spec = resolve_spec(options, self._defaults)
-            words = (*_words(options), "--run-dir", str(directory))
+            spec, words = self._settings(point, seed)
+            words = (*words, "--run-dir", str(directory))
             run = PlannedRun(name=own, point=point, seed=seed, directory=directory, spec=spec, words=words)
             _check_same(run)
             runs.append(run)
         return runs
-
-
-def _with_point(parsed: argparse.Namespace, point: Point, seed: int) -> argparse.Namespace:
-    """Return the options with the settings of a point."""
-    options = copy.copy(parsed)
-    options.seed = seed
-    options.set = [*parsed.set, *(f"{key}={value}" for key, value in point.items())]
-    return options
-
-
-def _words(options: argparse.Namespace) -> list[str]:
-    words = ["train", *([options.preset] if options.preset is not None else [])]
-    for name in ("env", "algorithm", "actors", "seed", "env_steps", "wrap"):
-        value = getattr(options, name)
-        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
-    words += [word for tracker in options.log for word in ("--log", tracker)]
-    return [*words, *(word for assignment in options.set for word in ("--set", assignment))]
 
 
 def point_name(point: Point) -> str:
