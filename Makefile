@@ -71,6 +71,7 @@ docs: .venv/ready-docs
 # The parts of the documentation that are made from the code: a test fails while they differ.
 docs-reference: .venv/ready-train
 	$(BIN)/python docs/generate_reference.py
+	$(BIN)/python docs/trace_rollout.py
 
 .venv/ready-docs: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -11,7 +11,7 @@ from daedalus.analysis.comparison import Estimate
 from daedalus.analysis.recorded_run import RecordedEvaluation, RunRecord
 from daedalus.analysis.run_groups import text
 from daedalus.analysis.statistics import interquartile_mean, mean_interval, stratified_bootstrap
-from daedalus.learner.run.event_file import RESTARTED, RESUMED, RecordedEvent
+from daedalus.learner.serving.events import RESTARTED, RESUMED, RecordedEvent
 from daedalus.protocol.texts import short_number, without_secrets
 
 _REPETITIONS = 2000

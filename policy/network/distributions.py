@@ -10,6 +10,7 @@ from torch.nn.functional import softplus
 
 from daedalus.policy.network.layers import variables_and_values
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace
+from daedalus.protocol.spec import PolicySpec
 
 
 class Distribution(nn.Module):
@@ -437,3 +438,18 @@ class Uniform(Distribution):
         """See Distribution: -1e30 for actions that are never chosen."""
         outside = (actions.abs() > _LARGEST_UNIFORM).any(-1)
         return torch.where(outside, _NEVER, self._log_density)
+
+
+def continuous_distribution(spec: PolicySpec, space: ContinuousSpace) -> Distribution:
+    """Return the built-in distribution `spec.distribution`. Raises ValueError if it needs bounds that `space` lacks."""
+    match spec.distribution:
+        case "squashed_gaussian" | "kumaraswamy" if not space.bounded:
+            raise ValueError("needs bounded actions")
+        case "squashed_gaussian":
+            return SquashedGaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
+        case "gaussian_mixture":
+            return GaussianMixture(space, initial_std=spec.initial_std, components=spec.mixture_components)
+        case "kumaraswamy":
+            return Kumaraswamy(space)
+        case _:
+            return Gaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
