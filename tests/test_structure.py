@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "gateway", "cli")
+PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "gateway", "analysis", "cli")
 ALLOWED = {
     "protocol": {"protocol"},
     "transport": {"protocol", "transport"},
@@ -18,6 +18,7 @@ ALLOWED = {
     "actor": {"protocol", "transport", "policy", "algorithms", "actor"},
     "learner": {"protocol", "transport", "policy", "algorithms", "learner"},
     "gateway": {"protocol", "transport", "policy", "actor", "gateway"},
+    "analysis": set(PACKAGES),
     "cli": set(PACKAGES),
 }
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
