@@ -110,8 +110,7 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("tensorboard_writer.py", "time.time"),
         ("mlflow_tracker.py", "time.time"),  # dates metrics
         ("logs.py", "time.strftime"),  # dates log records
-        ("events.py", "time.time"),  # dates events
-        ("event_file.py", "time.time"),  # dates restarts
+        ("events.py", "time.time"),  # dates events and restarts
         ("run_directory.py", "time.strftime"),
         ("certificate_authority.py", "datetime.datetime.now"),  # certificates are valid between two dates
         ("credentials.py", "time.time"),

@@ -1,10 +1,10 @@
-"""learner/run/annealing.py: no annealed setting jumps back when a run is resumed with another budget."""
+"""learner/run/counters.py: no annealed setting jumps back when a run is resumed with another budget."""
 
 import json
 
 import pytest
 
-from daedalus.learner.run.annealing import Annealing
+from daedalus.learner.run.counters import Annealing
 
 
 def test_progress_is_the_used_share_of_the_budget() -> None:

@@ -1,4 +1,4 @@
-"""learner/run/changes.py: which settings may change when a run is resumed."""
+"""learner/run/resuming.py: which settings may change when a run is resumed."""
 
 import shlex
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from building import run_spec
 
-from daedalus.learner.run.changes import with_changes
+from daedalus.learner.run.resuming import with_changes
 from daedalus.learner.run.settings import SettingsError
 from daedalus.protocol.spec import RunSpec
 

@@ -1,12 +1,12 @@
-"""learner/run/event_file.py: the events of a run, kept in its directory."""
+"""learner/serving/events.py: the events of a run, kept in its directory."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from daedalus.learner.run import event_file
-from daedalus.learner.run.event_file import EventFile, read_events
+from daedalus.learner.serving import events
+from daedalus.learner.serving.events import EventFile, read_events
 from daedalus.protocol.messages import Event
 
 
@@ -30,7 +30,7 @@ def test_events_of_several_processes_are_kept_in_order(tmp_path: Path) -> None:
 
 
 def test_the_file_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(event_file, "_MAX_BYTES", 1000)
+    monkeypatch.setattr(events, "_MAX_BYTES", 1000)
     file = EventFile(tmp_path)
     for _ in range(100):
         file.add([event("x" * 300)])

@@ -1,4 +1,4 @@
-"""learner/run/finished.py: whether a run has anything left to train."""
+"""learner/run/resuming.py: whether a run has anything left to train."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 from building import run_spec
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.finished import FinishedRun, finished_run
+from daedalus.learner.run.resuming import FinishedRun, finished_run
 from daedalus.learner.run.run_directory import write_json
 from daedalus.policy.saving.sealed import write_sealed
 

@@ -1,11 +1,11 @@
-"""learner/run/initial.py: what differs between a saved policy and a run that begins with its weights."""
+"""learner/run/resuming.py: what differs between a saved policy and a run that begins with its weights."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from daedalus.learner.run.initial import allows_other_spaces, other_network, other_spaces
+from daedalus.learner.run.resuming import allows_other_spaces, other_network, other_spaces
 from daedalus.learner.run.run_directory import create_locked
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces

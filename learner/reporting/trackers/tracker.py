@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from daedalus.learner.reporting.metrics import Details, MetricsWriter, tag
+from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter, tag
 from daedalus.learner.run.run_directory import run_name
 from daedalus.policy.user_modules import UserModules, modules_of
 
