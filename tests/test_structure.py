@@ -125,7 +125,7 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("cli.commands.exporter", {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"}),
         ("protocol.codec", {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),
         ("gateway.server", {"torch", "daedalus.learner", "daedalus.algorithms"}),
-        ("gateway.gateway", {"torch", "daedalus.learner", "daedalus.algorithms"}),
+        ("gateway.client_gateway", {"torch", "daedalus.learner", "daedalus.algorithms"}),
     ],
 )
 def test_a_process_loads_only_what_it_needs(module: str, absent: set[str]) -> None:

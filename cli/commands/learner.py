@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.algorithms.errors import AlgorithmError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.evaluation_processes import EvaluationFailedError
@@ -60,6 +59,7 @@ from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, chec
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, NetworkError, UserModuleError, allow_words, modules_of
+from daedalus.protocol.algorithms import AlgorithmError
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.credentials import (
