@@ -22,8 +22,8 @@ import torch
 from benchmarks.running import machine, table
 from daedalus.cli.ranks import StartedRanks
 from daedalus.learner.ranks.leader import NO_OTHER_RANKS, OtherRanks
+from daedalus.learner.run.process_resources import keep_freed_memory
 from daedalus.learner.run.settings import read_preset, run_spec
-from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec

@@ -21,8 +21,8 @@ from daedalus.cli.logs import add_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.changes import differing, fixed_changes
 from daedalus.learner.run.default_settings import default_settings
+from daedalus.learner.run.resuming import differing, fixed_changes
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.algorithms import ALGORITHMS

@@ -23,7 +23,7 @@ from daedalus.cli.running.run_locally import run_locally
 from daedalus.cli.settings_arguments import Choice, named_directory
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.initial import check_initial
+from daedalus.learner.run.resuming import check_initial
 from daedalus.learner.run.settings import SettingsError, assign
 from daedalus.policy.user_modules import refuse_while_imported
 

@@ -54,15 +54,12 @@ from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.descriptors import reserve_descriptors
-from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
-from daedalus.learner.run.initial import allows_other_spaces, initial_to_resume
+from daedalus.learner.run.process_resources import keep_freed_memory, reserve_descriptors
+from daedalus.learner.run.resuming import CheckpointMismatchError, allows_other_spaces, finished_run, initial_to_resume
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
-from daedalus.learner.training.allocator import keep_freed_memory
-from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings

@@ -11,7 +11,7 @@ from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.cli.ranks import follow
 from daedalus.learner.ranks.meeting import Meeting
-from daedalus.learner.training.allocator import keep_freed_memory
+from daedalus.learner.run.process_resources import keep_freed_memory
 from daedalus.policy.user_modules import UserModules
 
 

@@ -46,9 +46,7 @@ from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.training_display import TrainingDisplay
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.changes import with_changes
-from daedalus.learner.run.finished import FinishedRun, finished_run
-from daedalus.learner.run.initial import check_initial, initial_to_resume
+from daedalus.learner.run.resuming import FinishedRun, check_initial, finished_run, initial_to_resume, with_changes
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from daedalus.learner.reporting.metrics_file import lasting
+from daedalus.learner.reporting.metrics_rows import lasting
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
 from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked

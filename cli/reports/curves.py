@@ -9,7 +9,7 @@ from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import RETURN, RecordedRun
 from daedalus.cli.reports.charts import Series, line_chart
 from daedalus.cli.reports.markup import Html, element
-from daedalus.learner.reporting.metrics import ENV, USER
+from daedalus.learner.reporting.metrics_rows import ENV, USER
 
 _STD = "episode_return_std"
 _TITLES = {

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from daedalus.cli.reports.run_record import RunRecord
-from daedalus.learner.run.event_file import RESTARTED, RESUMED, RecordedEvent
+from daedalus.learner.serving.events import RESTARTED, RESUMED, RecordedEvent
 
 _FAILED = {"left", "refused", "failed", "rejected", "quarantined", RESTARTED}
 _NO_FAILURES = ("checkpoint saved", RESUMED)  # begin of the texts of checkpoints that did not fail

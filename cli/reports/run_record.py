@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from daedalus.cli.comparing.recorded_run import RecordedRun, record_command
-from daedalus.learner.run.event_file import RecordedEvent, read_events
 from daedalus.learner.run.run_directory import EVALUATION, EVENTS, OUTPUT, VERSIONS
 from daedalus.learner.run.run_files import RunDataError, read_json
+from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.protocol.texts import without_secrets
 

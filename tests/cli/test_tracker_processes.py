@@ -18,7 +18,7 @@ from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.tracking import tracker_processes
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 
 NAMES = ("wandb", "mlflow", "trackio")
 

@@ -14,7 +14,7 @@ from plain import PlainEnvironments, act, choices, plain_spaces
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.callbacks import TrainingRun
 from daedalus.cli.own_algorithm import with_record
-from daedalus.learner.reporting.metrics import Details, MetricsWriter
+from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter
 from daedalus.learner.run.settings import choose_algorithm, read_settings, run_spec
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime

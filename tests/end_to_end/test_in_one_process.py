@@ -13,7 +13,7 @@ from processes import LIMIT, Running, until
 
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.service import ActorService
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec

@@ -8,11 +8,15 @@ from typing import Any
 import pytest
 from building import run_spec
 
-from daedalus.learner.run.annealing import Annealing
-from daedalus.learner.run.changes import with_changes
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.finished import FinishedRun, finished_run
-from daedalus.learner.run.initial import allows_other_spaces, other_network, other_spaces
+from daedalus.learner.run.counters import Annealing, RunCounters
+from daedalus.learner.run.resuming import (
+    FinishedRun,
+    allows_other_spaces,
+    finished_run,
+    other_network,
+    other_spaces,
+    with_changes,
+)
 from daedalus.learner.run.run_directory import create_locked, write_json
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import SavedPolicy

@@ -1,4 +1,4 @@
-"""learner/run/evaluations.py: checkpoints are kept during their evaluation, the best permanently."""
+"""learner/serving/evaluations.py: checkpoints are kept during their evaluation, the best permanently."""
 
 import errno
 import os
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from building import EPOCH, SPACES, run_spec
 
-from daedalus.learner.reporting.metrics import COLUMNS
+from daedalus.learner.reporting.metrics_rows import COLUMNS
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.evaluations import Evaluations
+from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, load_newest, save_checkpoint
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy

@@ -1,6 +1,6 @@
-"""learner/serving/held_answers.py: which answers wait, and how long."""
+"""learner/serving/rollout_intake.py: which answers wait, and how long."""
 
-from daedalus.learner.serving.held_answers import HeldAnswers
+from daedalus.learner.serving.rollout_intake import HeldAnswers
 from daedalus.transport.interface import Request
 
 

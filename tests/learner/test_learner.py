@@ -15,8 +15,8 @@ from torch.testing import assert_close
 
 from daedalus.algorithms.gradients import Terms
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, save_checkpoint
-from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS, UpdateMetrics
 from daedalus.policy.network.actor_critic import ActorCritic

@@ -12,8 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from daedalus.learner.reporting.csv_writer import CsvWriter, cut_rows
-from daedalus.learner.reporting.metrics import COLUMNS, Details, tag
-from daedalus.learner.reporting.metrics_file import read_rows
+from daedalus.learner.reporting.metrics_rows import COLUMNS, Details, read_rows, tag
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.training.update_metrics import METRICS
 

@@ -1,4 +1,4 @@
-"""learner/reporting/report.py: metrics rows, status, summary."""
+"""learner/reporting/run_reporter.py: metrics rows, status, summary."""
 
 import dataclasses
 import json
@@ -11,16 +11,16 @@ import pytest
 from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_spec
 
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
-from daedalus.learner.reporting.episode_hint import EpisodeHint
-from daedalus.learner.reporting.metrics import COLUMNS
-from daedalus.learner.reporting.rates import RateMeter
-from daedalus.learner.reporting.report import (
+from daedalus.learner.reporting.learning_hints import EpisodeHint
+from daedalus.learner.reporting.metrics_rows import COLUMNS
+from daedalus.learner.reporting.run_reporter import (
+    RateMeter,
+    RunReporter,
     episode_statistics,
     metrics_row,
     run_status,
     summary,
 )
-from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health

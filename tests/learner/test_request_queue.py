@@ -1,4 +1,4 @@
-"""learner/serving/request_queue.py: first in, first out, bounded by bytes, number and waiting time."""
+"""learner/serving/rollout_intake.py: first in, first out, bounded by bytes, number and waiting time."""
 
 import queue
 import threading
@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daedalus.learner.serving import request_queue
-from daedalus.learner.serving.request_queue import RequestQueue
+from daedalus.learner.serving import rollout_intake
+from daedalus.learner.serving.rollout_intake import RequestQueue
 
 
 class UnansweredRequest:
@@ -58,7 +58,7 @@ def test_requests_are_refused_while_the_oldest_has_waited_long(monkeypatch: pyte
     queue = RequestQueue(100, 100)
     assert queue.offer(UnansweredRequest(1))
     assert queue.offer(UnansweredRequest(1))
-    monkeypatch.setattr(request_queue, "_OLDEST_SECONDS", -1.0)  # each waiting request has waited too long
+    monkeypatch.setattr(rollout_intake, "_OLDEST_SECONDS", -1.0)  # each waiting request has waited too long
     assert not queue.offer(UnansweredRequest(1))
     queue.take()
     queue.take()
@@ -69,7 +69,7 @@ def test_requests_that_have_waited_too_long_are_taken_at_once(monkeypatch: pytes
     queue, requests = RequestQueue(100, 100), [UnansweredRequest(size) for size in (3, 4)]
     assert all(queue.offer(request) for request in requests)
     assert queue.take_late() == []
-    monkeypatch.setattr(request_queue, "LATE_SECONDS", -1.0)
+    monkeypatch.setattr(rollout_intake, "LATE_SECONDS", -1.0)
     assert queue.take_late() == requests
     assert (queue.bytes, queue.take_late()) == (0, [])
 

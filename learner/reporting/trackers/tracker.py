@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from daedalus.learner.reporting.metrics import Details, MetricsWriter, tag
+from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter, tag
 from daedalus.learner.run.run_directory import run_name
 
 PROJECT = "daedalus"  # project or experiment of the runs, unless the tracker's environment variable names another

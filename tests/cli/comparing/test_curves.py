@@ -10,7 +10,7 @@ from recorded_runs import record
 from daedalus.cli.comparing.curves import evaluations, group_curve, points
 from daedalus.cli.comparing.recorded_run import RETURN, RecordedRun, read_run
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.run.run_directory import METRICS
 
 
