@@ -24,55 +24,26 @@ def sequences(rollouts: Sequence[Upload]) -> list[int]:
 # -------------------------------------------------------------------------------------------- the barrier
 
 
-def test_barrier_waits_for_every_live_actor_and_sorts_rollouts_by_name() -> None:
-    buffer, live = BarrierBuffer(1, lambda: 1 << 30), {"a", "b", "c"}
-    for actor in ("c", "a"):
-        buffer.add(rollout(actor))
-        assert actors(buffer.take(live, 0, 0.0)) == []
-    buffer.add(rollout("b"))
-    assert actors(buffer.take(live, 0, 0.0)) == ["a", "b", "c"]
-    assert actors(buffer.take(live, 1, 0.0)) == []
-
-
-def test_first_batch_of_the_barrier_waits_for_the_configured_number_of_actors() -> None:
-    buffer = BarrierBuffer(3, lambda: 1 << 30)
-    buffer.add(rollout("a"))
-    buffer.add(rollout("b"))
-    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
-    assert actors(buffer.take({"a", "b", "c"}, 0, 0.0)) == []
-    buffer.add(rollout("c"))
-    assert actors(buffer.take({"a", "b", "c"}, 0, 0.0)) == ["a", "b", "c"]
-
-
-def test_later_batches_of_the_barrier_wait_only_for_live_actors() -> None:
-    buffer = BarrierBuffer(2, lambda: 1 << 30)
-    buffer.add(rollout("a"))
-    buffer.add(rollout("b"))
-    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == ["a", "b"]
-    buffer.add(rollout("a"))
-    assert actors(buffer.take({"a"}, 1, 0.0)) == ["a"]
-
-
-def test_barrier_does_not_wait_for_an_actor_that_has_left() -> None:
-    buffer = BarrierBuffer(1, lambda: 1 << 30)
-    buffer.add(rollout("a"))
-    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
-    assert actors(buffer.take({"a"}, 0, 0.0)) == ["a"]
-
-
-def test_barrier_uses_the_rollout_of_an_actor_that_has_left() -> None:
-    buffer = BarrierBuffer(1, lambda: 1 << 30)
-    buffer.add(rollout("b"))
-    buffer.add(rollout("a"))
-    assert actors(buffer.take({"a"}, 0, 0.0)) == ["a", "b"]
-
-
-def test_barrier_waits_for_an_actor_that_joins_later() -> None:
-    buffer = BarrierBuffer(1, lambda: 1 << 30)
-    buffer.add(rollout("a"))
-    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
-    buffer.add(rollout("b"))
-    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == ["a", "b"]
+@pytest.mark.parametrize(
+    ("first", "steps"),
+    [
+        (1, ["c abc", "a abc", "b abc -> abc", " abc"]),  # in the order of names; each rollout counts once
+        (3, ["a ab", "b ab", " abc", "c abc -> abc"]),  # the first batch waits for the configured number of actors
+        (2, ["a ab", "b ab -> ab", "a a -> a"]),  # later ones only for the live
+        (1, ["a ab", " a -> a"]),  # not for an actor that has left
+        (1, ["b ab", "a a -> ab"]),  # whose rollout is used
+        (1, ["a ab", "b ab -> ab"]),  # for one that joins later
+        (0, [" "]),
+    ],
+)
+def test_barrier_waits_for_every_live_actor_and_sorts_rollouts_by_name(first: int, steps: list[str]) -> None:
+    """Each step: the actor whose rollout arrives, the live actors, and those of the batch that is then complete."""
+    buffer = BarrierBuffer(first, lambda: 1 << 30)
+    for version, step in enumerate(steps):
+        (arrived, live), batch = step.partition(" -> ")[0].split(" "), step.partition(" -> ")[2]
+        if arrived:
+            buffer.add(rollout(arrived))
+        assert actors(buffer.take(set(live), version, 0.0)) == list(batch), step
 
 
 def test_barrier_has_room_for_one_rollout_of_each_actor() -> None:
@@ -99,10 +70,6 @@ def test_batch_of_the_barrier_is_complete_when_its_rollouts_fill_the_memory(capl
     assert buffer.has_room_for(rollout("d"))
 
 
-def test_empty_barrier_returns_no_batch() -> None:
-    assert actors(BarrierBuffer(0, lambda: 1 << 30).take(set(), 0, 0.0)) == []
-
-
 # --------------------------------------------------------------------------------------------- the stream
 
 
@@ -118,18 +85,12 @@ def test_stream_returns_rollouts_of_all_actors_in_order_of_arrival() -> None:
 
 def test_stream_returns_stale_rollouts_separately() -> None:
     buffer = StreamBuffer(2, lambda _live: 3)
-    for sequence, version in enumerate((0, 1, 5, 1, 4)):
+    for sequence, version in enumerate((0, 1, 5, 1, 2)):  # the last at the bound
         buffer.add(rollout("a", sequence, version))
     taken = buffer.take({"a"}, 5, 0.0)
     assert sequences(taken.stale) == [0, 1, 3]
     assert sequences(taken.rollouts) == [2, 4]
     assert buffer.take({"a"}, 5, 0.0).stale == []
-
-
-def test_stream_returns_a_rollout_with_policy_lag_at_the_bound() -> None:
-    buffer = StreamBuffer(1, lambda _live: 3)
-    buffer.add(rollout("a", version=2))
-    assert sequences(buffer.take(set(), 5, 0.0).rollouts) == [0]
 
 
 def test_stream_returns_stale_rollouts_when_no_batch_is_complete() -> None:
