@@ -3,7 +3,7 @@
 import logging
 from pathlib import Path
 
-from daedalus.gateway.watching.source import OtherRun
+from daedalus.gateway.watching.page_data import OtherRun
 from daedalus.learner.reporting.metrics_rows import MetricsHistory, read_rows
 from daedalus.learner.run.run_directory import METRICS
 

@@ -18,7 +18,7 @@ from watched import HOSTILE, actor_status, observed, run_status
 from daedalus.cli.commands.certs import certs
 from daedalus.cli.status_query import ask
 from daedalus.gateway.places import Places
-from daedalus.gateway.tokens import OperatorToken
+from daedalus.gateway.security import OperatorToken
 from daedalus.protocol.messages import Event, Order
 from daedalus.transport.connecting import connect
 from daedalus.transport.memory import MemoryNetwork

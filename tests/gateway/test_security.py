@@ -26,10 +26,8 @@ from websockets.exceptions import ConnectionClosed
 
 from daedalus.cli.commands.certs import certs
 from daedalus.gateway import app, places, server
-from daedalus.gateway.errors import ClientError
-from daedalus.gateway.rate_limit import RateLimit
-from daedalus.gateway.security import guard
-from daedalus.gateway.tokens import TOKENS, Tokens, digest
+from daedalus.gateway.client_messages import ClientError
+from daedalus.gateway.security import TOKENS, RateLimit, Tokens, digest, guard
 from daedalus.transport.memory import MemoryNetwork
 
 Connect = Callable[..., JsonClient]

@@ -21,10 +21,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from daedalus.cli.commands.certs import certs
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.places import Places
-from daedalus.gateway.tokens import TOKENS, OperatorToken, Tokens, digest
-from daedalus.gateway.watching.source import OtherRun
+from daedalus.gateway.security import TOKENS, OperatorToken, Tokens, digest
+from daedalus.gateway.watching.page_data import OtherRun
 from daedalus.transport.memory import MemoryNetwork
 
 TOKEN = "an operator's token of some length"
