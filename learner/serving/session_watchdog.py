@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from daedalus.learner.serving.run_context import RunContext
+from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS
 from daedalus.protocol.messages import ActorsReport, ActorsRequest
@@ -29,20 +31,11 @@ LOOK = encode(ActorsRequest(after="~"))
 class SessionWatchdog:
     """Watchdog of one transport, from `open` to `close`."""
 
-    def __init__(
-        self, transport: Transport, status_key: str, learner_epoch: int, on_newer: Callable[[int], None]
-    ) -> None:
-        """Construct the watchdog.
-
-        Args:
-          transport: the network.
-          status_key: key of the status, which this learner serves. The session is dead if a query on this key over
-            another session has no answer.
-          learner_epoch: epoch of this learner process.
-          on_newer: called once, on the watchdog's thread, with the epoch of a newer learner of the run.
-        """
-        self._transport, self._status_key = transport, status_key
-        self._epoch, self._on_newer = learner_epoch, on_newer
+    def __init__(self, context: RunContext, transport: Transport, on_newer: Callable[[int], None]) -> None:
+        """`on_newer` is called once, on the watchdog's thread, with the epoch of a newer learner of the run."""
+        self._transport, self._on_newer, self._epoch = transport, on_newer, context.learner_epoch
+        # This learner serves the key. The session is dead if a query on it over another session has no answer.
+        self._status_key = keys.status(context.name)
         self._older: set[int] = set()  # epochs of older learners that were logged
         self._heard_at = self._tried_at = time.monotonic()
         self._closed = threading.Event()

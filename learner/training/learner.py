@@ -82,7 +82,7 @@ class Learner:
             )
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
-        self._spec, self._spaces = spec, spaces
+        self._spec, self.spaces = spec, spaces
         self._other_ranks = other_ranks
         self.device = torch.device(spec.device)
         self._network = ActorCritic(policy, spaces, modules, spec).to(self.device)
@@ -313,7 +313,7 @@ class Learner:
 
     def program(self) -> bytes:
         """Return the policy program (daedalus/policy/acting/program.py)."""
-        return export_program(self._network, self._spaces)
+        return export_program(self._network, self.spaces)
 
     def weights(self) -> dict[str, np.ndarray]:
         """Return all parameters as numpy arrays.

@@ -15,7 +15,8 @@ from daedalus.actor.session.service import ActorService
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec
-from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.service import LearnerService, Outcome, Outputs
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -33,15 +34,9 @@ def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
     """Train with learner and actors as threads of this process, over the memory transport."""
     network, stop = MemoryNetwork(), threading.Event()
     run_directory.create(directory, spec)
-    service = LearnerService(
-        spec,
-        directory,
-        MemoryTransport(network),
-        stop,
-        Progress(io.StringIO(), spec.training.env_steps),
-        [],
-        started=0.0,
-    )
+    context = RunContext.begin(directory, spec, stop)
+    progress = Progress(io.StringIO(), spec.training.env_steps)
+    service = LearnerService(context, MemoryTransport(network), Outputs(progress=progress))
     outcomes: list[Outcome] = []
     threads = [threading.Thread(target=lambda: outcomes.append(service.run()), daemon=True)]
     for index in range(spec.collection.actors):
