@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.cli.arguments import (
-    MOST_PROCESSES,
     add_allow_module,
     add_insecure,
-    add_processes,
     add_reset_statistics,
     add_tls,
     command_parser,
@@ -42,7 +40,6 @@ examples:
   daedalus learner --env Acrobot-v1 --set training.learning_rate=0.001 --run-dir runs/acrobot
   daedalus learner cartpole --listen tls/0.0.0.0:7447 --tls certs/learner      (daedalus certs --help)
   daedalus learner cartpole --connect tcp/router:7447
-  daedalus learner car_racing_article --processes 2
   daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
   daedalus learner --run-dir runs/mine --resume --env-steps 3000000      (the whole budget, with the steps already done)
 
@@ -212,17 +209,6 @@ def check_environment(env: str | None, settings: dict[str, Any]) -> None:
         raise SettingsError(f"--env {env} and environment.id={chosen} are two environments: leave one of them out")
 
 
-def check_processes(number: int, spec: RunSpec) -> None:
-    """Raise SettingsError if a learner of so many processes cannot learn what `spec` defines."""
-    if number > 1 and spec.uploads_gradients:
-        raise SettingsError(
-            "collection.upload is gradients: the actors compute them, so that several processes of the learner would "
-            "have nothing to do; leave out --processes, or set collection.upload=rollouts"
-        )
-    if not 1 <= number <= MOST_PROCESSES:
-        raise SettingsError(f"the learner cannot have {number} processes: choose a number from 1 to {MOST_PROCESSES}")
-
-
 def named_directory(preset: str | None, spec: RunSpec) -> Path:
     """Return the default run directory, named after the preset or file, or after the environment.
 
@@ -317,7 +303,6 @@ def learner_parser() -> argparse.ArgumentParser:
         "For a supervisor that repeats the same command. Another --env-steps or --set changes the run from then on",
     )
     add_reset_statistics(options, "with --resume: ")
-    add_processes(options)
     add_allow_module(options, "config.toml of an existing run")
     add_tls(options)
     add_insecure(options)

@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from daedalus.learner.ranks.errors import RankLostError
-from daedalus.learner.ranks.opening import OpenRanks, no_other_ranks
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.run_reporter import RunReporter, continue_records
@@ -28,7 +26,6 @@ from daedalus.protocol.messages import RunStatus
 from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:
-    from daedalus.learner.ranks.leader import OtherRanks
     from daedalus.learner.training.checkpointer import Checkpointer
     from daedalus.learner.training.learner import Learner
     from daedalus.learner.training_loop import TrainingLoop
@@ -70,7 +67,6 @@ class LearnerService:
         outputs: Outputs,
         beginning: Beginning = NO_WEIGHTS,
         *,
-        open_ranks: OpenRanks = no_other_ranks,
         confirms: bool = False,
     ) -> None:
         """Construct the service.
@@ -80,16 +76,14 @@ class LearnerService:
           transport: the network; the caller closes it.
           outputs: where the metrics of the run go.
           beginning: what the policy begins with.
-          open_ranks: connects the other processes of the learner.
           confirms: whether a launcher plays new episodes to confirm that the target is reached.
         """
-        self._context, self._beginning, self._outputs, self._open_ranks = context, beginning, outputs, open_ranks
-        self._ranks: OtherRanks | None = None  # None: not connected yet
+        self._context, self._outputs, self._beginning = context, outputs, beginning
         self._heartbeat = Heartbeat(context.directory)
         self._server = ActorServer(context, transport, self._status)
         self._confirmation = None
         if confirms and context.spec.training.stop_when_solved:
-            self._confirmation = TargetConfirmation(context, self._beat)
+            self._confirmation = TargetConfirmation(context, self._heartbeat.beat)
         self._reporter = RunReporter(context, outputs.user_metrics)
 
     def run(self) -> Outcome:
@@ -98,8 +92,7 @@ class LearnerService:
         Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
         learner serves the run, CheckpointMismatchError if a checkpoint does not fit the settings, NetworkError if
         the policy or the algorithm does not support the spaces, SettingsError if the device is not available or
-        rollouts are too short for masked actions, RankLostError or RanksDisagreeError of the other processes of the
-        learner.
+        rollouts are too short for masked actions.
         """
         self._heartbeat.start()
         try:
@@ -107,37 +100,23 @@ class LearnerService:
             continue_records(self._context)
             from daedalus.learner.training.learner import Learner
 
-            self._ranks = ranks = self._open_ranks(self._context.spec, self._context.stop)
-            if ranks is None or (self._context.fleet.spaces is None and not self._server.await_actor(self._beat)):
+            if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):
                 return self._stopped_without_actors()
             spaces = self._context.fleet.spaces
             assert spaces is not None
             spec = self._context.spec
             check_rollout_length(spec, spaces)
-            learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules, ranks)
+            learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
             self._beginning.load_into(learner, spec, self._context.progress)
             checkpointer, loop = self._training_of(learner)
             if self._beginning.initial is not None:
                 checkpointer.begin()  # a learner that is killed before its first checkpoint continues from this one
-            ranks.begin(spaces, learner.shared_state)
-            if self._beginning.restored is None and not self._server.await_actor(self._beat):
+            if self._beginning.restored is None and not self._server.await_actor(self._heartbeat.beat):
                 return self._stopped_without_actors()
             return self._learn(learner, checkpointer, loop)
-        except RankLostError:
-            if not self._context.stop.is_set():  # a signal may end all processes of the learner at once
-                raise
-            return self._stopped_without_actors()
         finally:
             self._server.close(_STOPPED)  # unless it is closed
             self._heartbeat.clear()
-            if self._ranks is not None:
-                self._ranks.close()
-
-    def _beat(self) -> None:
-        """Show the supervisor and the other ranks that this process works."""
-        self._heartbeat.beat()
-        if self._ranks is not None:
-            self._ranks.wait()
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
@@ -157,7 +136,9 @@ class LearnerService:
 
         program = learner.program()
         checkpointer = Checkpointer(self._context, learner, program)
-        loop = TrainingLoop(self._context, self._server, learner, checkpointer, self._confirmation, self._beat)
+        loop = TrainingLoop(
+            self._context, self._server, learner, checkpointer, self._confirmation, self._heartbeat.beat
+        )
         loop.publish(program)
         return checkpointer, loop
 
@@ -174,9 +155,6 @@ class LearnerService:
         try:
             ended = loop.run(reporter)
             finished = context.is_finished
-        except RankLostError:
-            if not self._context.stop.is_set():  # a signal may end all processes of the learner at once
-                raise
         finally:
             ended = ended or time.monotonic()
             try:

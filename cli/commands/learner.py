@@ -4,8 +4,7 @@ Exit status: 0 the target was reached, all steps were done without a target to s
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed, or the last checkpoint could not be
 saved; 2 bad usage; 7 a newer learner of the run has taken over. Under `daedalus train` a learner that a signal stopped
 exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED. A supervised learner whose last
-checkpoint could not be saved exits with processes.UNSAVED. A learner of several processes that has lost one exits with
-processes.RANK_LOST, and is then started again.
+checkpoint could not be saved exits with processes.UNSAVED.
 """
 
 import argparse
@@ -41,12 +40,9 @@ from daedalus.cli.processes import (
     stop_on_signals,
 )
 from daedalus.cli.quick_check import expected_defaults, expected_spaces
-from daedalus.cli.ranks import RankProcesses, StartedRanks, follow_launched, meeting_for, ranks_for
 from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
-from daedalus.cli.supervised_learner import supervise_learner
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
-from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
 from daedalus.learner.reporting.recorder import OpenWriter
@@ -98,7 +94,6 @@ _FAILURES = (
     DamagedError,
     NetworkError,
     NoPolicyError,
-    RanksDisagreeError,
     SettingsError,
     TransportError,
 )
@@ -108,8 +103,7 @@ def main() -> int:
     """Run `daedalus learner` and return its exit status."""
     started = time.monotonic()
     arguments = learner_parser().parse_args()
-    surroundings = Surroundings()  # a network or an algorithm of the user may change them
-    here = surroundings.directory
+    here = Surroundings().directory  # a network or an algorithm of the user may change it
     keep_freed_memory()
     raise_descriptor_limit()
     reserve_descriptors()
@@ -119,20 +113,11 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop, user_metrics.add_line)
     try:
-        meeting = meeting_for(arguments)
-        if meeting is not None and meeting.rank > 0:
-            return follow_launched(meeting, arguments, stop)
         credentials = learner_credentials(arguments)
         run = choose_run(arguments)
         run = replace(run, directory=here / run.directory)
-        ranks = ranks_for(arguments, run, meeting)
-        if arguments.init_from is not None:  # in the options of all ranks it is as it was typed
+        if arguments.init_from is not None:
             arguments.init_from = here / arguments.init_from
-        if isinstance(ranks, StartedRanks) and not arguments.exit_with_parent:
-            if arguments.run_dir is None:
-                run, _ = _with_spaces(run, arguments, stop)
-            surroundings.restore()
-            return supervise_learner(run.directory, arguments, stop)
     except ModuleNotAllowedError as error:
         print_error("learner", allowing(error, ["daedalus", "learner", *sys.argv[1:]]))
         return BAD_USAGE
@@ -155,14 +140,9 @@ def main() -> int:
             started=arguments.started or started,
             user_metrics=user_metrics,
             context=context,
-            ranks=ranks,
         )
         with ExitStack() as stack:
             return command.serve(run, stack)
-    except RankLostError as error:
-        text, status = ranks.fault(error)
-        print_error("learner", text)
-        return status
     except _FAILURES as error:
         print_error("learner", error)
         return FAILED
@@ -179,12 +159,11 @@ class _Command:
     started: float  # on the monotonic clock
     user_metrics: UserMetrics
     context: dict[str, str]  # receives the fields of the log
-    ranks: RankProcesses  # the other processes of the learner
 
     def serve(self, run: ChosenRun, stack: ExitStack) -> int:
         """Run the learner to its end and return the exit status; `stack` closes what is opened.
 
-        Raises _FAILURES or RankLostError.
+        Raises _FAILURES.
         """
         arguments = self.arguments
         if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
@@ -195,12 +174,10 @@ class _Command:
         resumed = arguments.resume and run.exists
         if resumed and (reason := run_directory.why_superseded(run.directory)):
             print_error("learner", reason)
-            self.ranks.dismiss(run.spec, self.stop)
             return SUPERSEDED
         finished = finished_run(run.directory, run.spec) if resumed else None
         if finished is not None:
             _logger.info("nothing to do: %s", finished.reason)
-            self.ranks.dismiss(run.spec, self.stop)
             return NOT_REACHED if finished.missed else REACHED
         if run.changed:
             _logger.info("settings of the run changed: %s", ", ".join(run.changed))
@@ -215,7 +192,6 @@ class _Command:
         stopped = STOPPED if arguments.prepared else 0
         if transport is None:  # stopped while no router answered
             return stopped
-        stack.enter_context(self.ranks)
         stack.callback(transport.close)
         run = run if run.exists else self._with_directory(run, stack)
         try:
@@ -273,7 +249,7 @@ class _Command:
         outputs = Outputs(progress=self.progress, writers=writers, user_metrics=self.user_metrics)
         self.context["epoch"] = f"{context.learner_epoch:x}"
         confirms = arguments.confirm or (arguments.prepared is None and _confirms(run.spec))
-        return LearnerService(context, transport, outputs, beginning, open_ranks=self.ranks.open, confirms=confirms)
+        return LearnerService(context, transport, outputs, beginning, confirms=confirms)
 
 
 def _with_spaces(
