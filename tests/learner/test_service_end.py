@@ -124,7 +124,7 @@ def test_last_checkpoint_is_saved_although_the_last_metrics_fail(
     def fail(*_: object, last: bool) -> None:
         raise ZeroDivisionError("a bug in a diagnostic of the user's algorithm")
 
-    monkeypatch.setattr(RunReporter, "details", fail)
+    monkeypatch.setattr(RunReporter, "row", fail)
     learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
     actor = GatedActor(network, "actor")
     actor.open_gate()
