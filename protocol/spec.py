@@ -355,6 +355,13 @@ class ServiceSpec(Specification):
     """Seconds between rows of metrics."""
     queue_megabytes: Annotated[float, Field(gt=0.0)] = 64.0
     """MiB of rollouts that may wait to be decoded. Rollouts beyond this limit are answered `busy`."""
+    metrics_writers: tuple[Annotated[str, Field(pattern=rf"^{_OBJECT}$", max_length=200)], ...] = ()
+    """`module:Class` of metrics writers of your own, which are constructed with the path of the run directory."""
+
+    @property
+    def user_modules(self) -> dict[str, str]:
+        """Settings that name a module as `module:name`, with their values."""
+        return {f"service.metrics_writers.{place}": value for place, value in enumerate(self.metrics_writers)}
 
     @property
     def queue_bytes(self) -> int:
@@ -542,12 +549,13 @@ class RunSpec(Specification):
     @property
     def learner_modules(self) -> dict[str, str]:
         """Those of `user_modules` that the learner imports."""
-        return {**self.policy.user_modules, **self.training.user_modules}
+        return {**self.learning.user_modules, **self.service.user_modules}
 
     @property
     def actor_modules(self) -> dict[str, str]:
         """Those of `user_modules` that an actor imports: with gradients, also the learner's."""
-        return self.user_modules if self.uploads_gradients else self.environment.user_modules
+        learning = self.learning.user_modules if self.uploads_gradients else {}
+        return {**self.environment.user_modules, **learning}
 
     @property
     def learning(self) -> LearningSpec:

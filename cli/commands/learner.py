@@ -43,10 +43,8 @@ from daedalus.cli.quick_check import expected_defaults, expected_spaces
 from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
-from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
-from daedalus.learner.reporting.recorder import OpenWriter
-from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
+from daedalus.learner.reporting.recorder import OpenWriter, metrics_writers
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
@@ -245,7 +243,7 @@ class _Command:
             reset_statistics=arguments.reset_statistics,
             modules=run.modules,
         )
-        writers = _writers(run.directory, arguments.rows_to)
+        writers = _writers(run, arguments.rows_to)
         outputs = Outputs(progress=self.progress, writers=writers, user_metrics=self.user_metrics)
         self.context["epoch"] = f"{context.learner_epoch:x}"
         confirms = arguments.confirm or (arguments.prepared is None and _confirms(run.spec))
@@ -266,12 +264,9 @@ def _with_spaces(
     return replace(run, spec=chosen, directory=run.directory.with_name(directory.name)), spaces
 
 
-def _writers(directory: Path, rows_to: int | None) -> list[OpenWriter]:
+def _writers(run: ChosenRun, rows_to: int | None) -> list[OpenWriter]:
     """Return the metrics writers; `rows_to` is a pipe to the program that started the run."""
-    writers: list[OpenWriter] = [
-        lambda: CsvWriter(directory / run_directory.METRICS),
-        lambda: TensorBoardWriter(directory),
-    ]
+    writers = metrics_writers(run.directory, run.spec.service, run.modules)
     return writers if rows_to is None else [lambda: RowsWriter(rows_to), *writers]
 
 

@@ -9,10 +9,17 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 
+from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter
 from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run.process_resources import reserved_descriptors
+from daedalus.learner.run.run_directory import METRICS
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spec import ServiceSpec
 
 _QUEUED_ROWS = 256  # further rows are dropped
 _RETRY_SECONDS = 10.0  # after a writer failed
@@ -21,6 +28,18 @@ _CLOSE_SECONDS = 5.0
 _logger = logging.getLogger(__name__)
 
 OpenWriter = Callable[[], MetricsWriter]  # opens the files; raises OSError
+
+
+def metrics_writers(directory: Path, service: ServiceSpec, modules: UserModules) -> list[OpenWriter]:
+    """Return the metrics writers of a run in a directory: those of the package, and those that the settings name.
+
+    Raises UserModuleError if one cannot be imported.
+    """
+    named = [modules.attribute(setting, value) for setting, value in service.user_modules.items()]
+    return [
+        lambda: CsvWriter(directory / METRICS),
+        *(partial(writer, directory) for writer in (TensorBoardWriter, *named)),
+    ]
 
 
 class Recorder:

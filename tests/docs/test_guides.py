@@ -14,13 +14,14 @@ from plain import PlainEnvironments, act, choices, plain_spaces
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.callbacks import TrainingRun
 from daedalus.cli.own_algorithm import with_record
-from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter
+from daedalus.learner.reporting.metrics_rows import Details
+from daedalus.learner.reporting.recorder import metrics_writers
 from daedalus.learner.run.settings import choose_algorithm, read_settings, run_spec
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace
-from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, ServiceSpec, TrainingSpec
 
 
 @pytest.fixture
@@ -102,7 +103,10 @@ def test_the_algorithm_of_action_values_learns(folder: Path) -> None:
 def test_the_metrics_writer_writes(folder: Path) -> None:
     (folder / "json_lines.py").write_text(example("metrics_writer.md"))
     sys.path.append(str(folder))
-    writer: MetricsWriter = importlib.import_module("json_lines").JsonLinesWriter(folder / "metrics.jsonl")
+    service = ServiceSpec(metrics_writers=("json_lines:JsonLinesWriter",))
+    modules = UserModules(frozenset({"json_lines"}))
+    *_, open_writer = metrics_writers(folder, service, modules)
+    writer = open_writer()
     writer.write({"env_steps": 1.0}, Details())
     writer.close()
     assert (folder / "metrics.jsonl").read_text() == '{"env_steps": 1.0}\n'
