@@ -45,7 +45,7 @@ from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parse
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.progress import Progress, SilentProgress
 from daedalus.learner.reporting.recorder import OpenWriter, metrics_writers
-from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
+from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.heartbeat import Heartbeat

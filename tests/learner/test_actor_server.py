@@ -12,7 +12,7 @@ from log_lines import LINES
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving import rollout_intake, session_watchdog
+from daedalus.learner.serving import actor_server, rollout_intake
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol import keys
@@ -314,7 +314,7 @@ class UnreachableTransport(MemoryTransport):
 
 
 def test_session_is_reopened_when_no_request_arrives(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 0.02)
+    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 0.02)
     transport = UnreachableTransport(network)
     server = ActorServer(run_context(), transport, no_status)
     server.open()
@@ -326,7 +326,7 @@ def test_session_is_reopened_when_no_request_arrives(network: MemoryNetwork, mon
 
 
 def test_request_resets_the_session_watchdog(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 1000.0)
+    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 1000.0)
     server = open_server(network, run_spec(), RunCounters(10))
     try:
         before = server._watchdog._heard_at
@@ -500,7 +500,7 @@ def version_of(data: bytes | None) -> int:
 def test_a_learner_steps_down_for_a_newer_one_of_its_run(
     network: MemoryNetwork, difference: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_watchdog, "_LOOK_SECONDS", 0.02)
+    monkeypatch.setattr(actor_server, "_LOOK_SECONDS", 0.02)
     transport, other, actor = MemoryTransport(network), MemoryTransport(network), MemoryTransport(network)
     server = ActorServer(run_context(), transport, no_status)
     stop, orders = server.context.stop, server.orders
