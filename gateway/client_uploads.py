@@ -4,8 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from daedalus.actor.session.client_reports import ClientReports
-from daedalus.actor.session.upload_session import UploadSession
+from daedalus.actor.session.uploading import ClientReports, UploadSession
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Join, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity

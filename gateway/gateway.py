@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from daedalus.actor.session.origin import own_origin
-from daedalus.actor.session.upload_session import UploadSession
+from daedalus.actor.session.actor_config import own_origin
+from daedalus.actor.session.uploading import UploadSession
 from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_spaces import ClientSpaces

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from daedalus.actor.errors import ActorError, NameInUseError
-from daedalus.actor.session.run_end import RunOverError
+from daedalus.actor.session.conversation import RunOverError
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.followed_run import FollowedRun

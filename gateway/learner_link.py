@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from daedalus.actor.errors import ActorError, LearnerLostError
-from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
-from daedalus.actor.session.snapshot_feed import SnapshotFeed
-from daedalus.actor.session.state_lock import StateLock
+from daedalus.actor.session.conversation import LearnerPresence, LearnerQueries, RunEndWatch, RunOverError
+from daedalus.actor.session.session_thread import StateLock
+from daedalus.actor.session.snapshots import SnapshotFeed
 from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.protocol import keys

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from plain import ACTION, NAME, vector_spaces
 
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.run_end import RunEndWatch
+from daedalus.actor.session.conversation import LearnerQueries, RunEndWatch
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits

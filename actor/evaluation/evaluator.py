@@ -14,10 +14,8 @@ import numpy as np
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.origin import own_origin
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
+from daedalus.actor.session.actor_config import ActorConfig, own_origin
+from daedalus.actor.session.conversation import LearnerQueries, RunEndWatch, RunOverError
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import EvaluationReport, Join, Snapshot, Welcome
 from daedalus.protocol.texts import short_number

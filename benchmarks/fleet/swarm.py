@@ -17,9 +17,8 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 
-from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.run_end import RunEndWatch
+from daedalus.actor.session.conversation import LearnerQueries, RunEndWatch
+from daedalus.actor.session.uploading import InFlightRollouts
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from processes import LIMIT
 
-from daedalus.actor.session import compact_snapshot_fetcher
-from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
+from daedalus.actor.session import snapshots
+from daedalus.actor.session.snapshots import CompactSnapshotFetcher
 from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -62,7 +62,7 @@ class Fetcher(CompactSnapshotFetcher):
 
 @pytest.fixture
 def ends(monkeypatch: pytest.MonkeyPatch) -> tuple[Learner, Fetcher]:
-    monkeypatch.setattr(compact_snapshot_fetcher, "_RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(snapshots, "_RETRY_SECONDS", 0.0)
     network = MemoryNetwork()
     learner = Learner(network)
     learner.fetcher, learner.taken = Fetcher(MemoryTransport(network), "r", "a", lambda: None), []
@@ -99,13 +99,13 @@ def test_requests_in_parallel_are_limited(ends: tuple[Learner, Fetcher]) -> None
     assert learner.requests.qsize() == 1
     for _ in range(3):
         learner.answer(1)
-        assert learner.requests.qsize() == compact_snapshot_fetcher._PARALLEL_PARTS
+        assert learner.requests.qsize() == snapshots._PARALLEL_PARTS
 
 
 def test_fetch_continues_while_the_actor_collects(ends: tuple[Learner, Fetcher]) -> None:
     learner, fetcher = ends
     fetcher.request_newest()
-    assert len(learner.answer(taking=False)) > compact_snapshot_fetcher._PARALLEL_PARTS
+    assert len(learner.answer(taking=False)) > snapshots._PARALLEL_PARTS
     end_rest(fetcher)
     fetcher.request_newest()  # not before this snapshot was taken: the next is a difference to it
     assert learner.requests.empty()
@@ -118,7 +118,7 @@ def test_link_rests_for_as_long_as_the_fetch_took(
 ) -> None:
     learner, fetcher = ends
     now = 100.0
-    monkeypatch.setattr(compact_snapshot_fetcher.time, "monotonic", lambda: now)
+    monkeypatch.setattr(snapshots.time, "monotonic", lambda: now)
     fetcher.request_newest()
     now = 107.0
     learner.answer()
@@ -178,7 +178,7 @@ def part(number: int, size: int) -> bytes:
 def test_parts_are_together_no_larger_than_a_snapshot(
     ends: tuple[Learner, Fetcher], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compact_snapshot_fetcher, "LEARNER_LIMITS", Limits(max_bytes=10_000, max_header_bytes=0))
+    monkeypatch.setattr(snapshots, "LEARNER_LIMITS", Limits(max_bytes=10_000, max_header_bytes=0))
     learner, fetcher = ends
     fetcher.request_newest()
     for number in range(2):

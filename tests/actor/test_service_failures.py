@@ -11,8 +11,8 @@ from processes import LIMIT, until
 from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session import learner_queries, runtime_maker, service, session_monitor
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
+from daedalus.actor.session import actor_service, conversation, session_engine
+from daedalus.actor.session.conversation import RunEndWatch, RunOverError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
 from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome, new_epoch
@@ -62,7 +62,7 @@ def test_drained_actor_ends(
     network: MemoryNetwork, actor: RunningActor, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The join is refused if the actor sends nothing, because it waits for the other actors of a2c."""
-    monkeypatch.setattr(session_monitor, "_SILENCE_SECONDS", 1e6 if how == "verdict" else 0.1)
+    monkeypatch.setattr(session_engine, "_SILENCE_SECONDS", 1e6 if how == "verdict" else 0.1)
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
@@ -134,7 +134,7 @@ def test_unexpected_error_is_reported_with_its_type(network: MemoryNetwork, monk
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a fault of a simulator")
 
-    monkeypatch.setattr(service.ActorService, "_collect", fail)
+    monkeypatch.setattr(actor_service.ActorService, "_collect", fail)
     learner = ScriptedLearner(network)
     actor = RunningActor(network)
     learner.publish(0)
@@ -163,7 +163,7 @@ def test_actor_ends_with_the_reason_when_its_certificate_is_refused(
         raise RefusedError("the certificate expired on 2030-01-01: renew it")
 
     monkeypatch.setattr(MemoryTransport, "reopen", reopen)
-    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.02)
+    monkeypatch.setattr(conversation, "_REOPEN_SECONDS", 0.02)
     actor = RunningActor(network)
     actor.join()
     assert isinstance(actor.error, ActorError)
@@ -200,12 +200,12 @@ def test_actors_keep_to_the_newer_of_two_learners_of_one_run(
 def test_an_older_learner_that_does_not_step_down_is_not_waited_for(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learner_queries, "_STEP_DOWN_SECONDS", 0.05)
+    monkeypatch.setattr(conversation, "_STEP_DOWN_SECONDS", 0.05)
     older, newer = ScriptedLearner(network, epoch=new_epoch(1)), ScriptedLearner(network, epoch=new_epoch(2))
     transport = MemoryTransport(network)
     end = RunEndWatch(transport, threading.Event())
     join = Join(actor="a", incarnation=1)
-    welcome = learner_queries.LearnerQueries(transport).join_learner("*", join, None, end)
+    welcome = conversation.LearnerQueries(transport).join_learner("*", join, None, end)
     assert welcome.learner_epoch == newer.epoch
     assert older.epoch < newer.epoch
 
@@ -268,7 +268,7 @@ def test_actor_that_waits_for_another_run_names_the_runs_that_are_there(network:
 def test_actor_stays_with_the_run_that_it_joined_first_unless_told_otherwise(
     network: MemoryNetwork, any_run: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learner_queries, "_LOOK_AROUND_SECONDS", 0.1)
+    monkeypatch.setattr(conversation, "_LOOK_AROUND_SECONDS", 0.1)
     first = ScriptedLearner(network, run="first")
     actor = RunningActor(network, any_run=any_run)
     first.publish(0)
@@ -325,7 +325,7 @@ def test_consecutive_rejections_are_warned_of_once_with_the_reason(network: Memo
 def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
     network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_monitor, "_SILENCE_SECONDS", 0.1)
+    monkeypatch.setattr(session_engine, "_SILENCE_SECONDS", 0.1)
     learner = ScriptedLearner(network)
     learner.publish(0)
     held = [learner.receive(), learner.receive()]  # never answered
@@ -344,7 +344,7 @@ def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
 def test_actor_reopens_its_transport_while_nobody_answers(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
+    monkeypatch.setattr(conversation, "_REOPEN_SECONDS", 0.0)
     reopened = threading.Semaphore(0)
 
     def reopen(transport: MemoryTransport) -> bool:
@@ -366,7 +366,7 @@ def test_actor_reopens_its_transport_while_nobody_answers(
 def test_actor_that_is_stopped_while_its_transport_is_reopened_ends(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
+    monkeypatch.setattr(conversation, "_REOPEN_SECONDS", 0.0)
     reopening, ended = threading.Event(), threading.Event()
 
     def reopen(transport: MemoryTransport) -> bool:
@@ -391,7 +391,7 @@ def test_an_actor_that_is_stopped_during_a_query_sends_no_other_query(
     learner = ScriptedLearner(network)
     learner.publish(0)
     actor = RunningActor(network, begin=False)
-    monkeypatch.setattr(runtime_maker, "_SLOW_LINK_SECONDS", -LIMIT)  # the link is measured by several queries
+    monkeypatch.setattr(session_engine, "_SLOW_LINK_SECONDS", -LIMIT)  # the link is measured by several queries
     query, sent = actor.transport.query, list[str]()
 
     def stopping_query(key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:

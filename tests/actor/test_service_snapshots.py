@@ -10,8 +10,8 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.actor.session import learner_queries, runtime_maker, service, snapshot_feed, snapshot_source
-from daedalus.actor.session.config import LinkChoice
+from daedalus.actor.session import actor_service, conversation, session_engine, snapshots
+from daedalus.actor.session.actor_config import LinkChoice
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
@@ -25,7 +25,9 @@ def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(networ
     actor = RunningActor(network, link="wan")
     learner = ScriptedLearner(network)
     learner.publish(3)
-    received = [learner.receive() for _ in range(service._SLOW_LINK_WINDOW)]  # a dropped request would be sent again
+    received = [
+        learner.receive() for _ in range(actor_service._SLOW_LINK_WINDOW)
+    ]  # a dropped one is sent again
     assert [rollout.policy_version for rollout, _ in received] == [3] * len(received)
     assert [rollout.identity.sequence for rollout, _ in received] == list(range(len(received)))
     assert learner.rollouts.empty()
@@ -44,7 +46,7 @@ def test_actor_never_subscribes_on_a_link_measured_as_slow(
         return subscribe(transport, key, on_news)
 
     monkeypatch.setattr(MemoryTransport, "subscribe", noted)
-    monkeypatch.setattr(runtime_maker, "_SLOW_LINK_SECONDS", -LIMIT)
+    monkeypatch.setattr(session_engine, "_SLOW_LINK_SECONDS", -LIMIT)
     learner = ScriptedLearner(network)
     learner.publish(3)
     actor = RunningActor(network)
@@ -102,7 +104,7 @@ def test_actor_fetches_its_snapshots_once_or_twice_for_a_rollout_and_is_pushed_n
 
 def test_actor_with_slow_rollouts_fetches_differences(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three slow rollouts in a row; then differences, as promptly as whole snapshots."""
-    monkeypatch.setattr(snapshot_source, "_SLOW_SECONDS", 0.0)
+    monkeypatch.setattr(session_engine, "_SLOW_SECONDS", 0.0)
     learner = ScriptedLearner(network)
     learner.publish(0)
     actor = RunningActor(network)
@@ -124,9 +126,9 @@ def test_actor_with_slow_rollouts_fetches_differences(network: MemoryNetwork, mo
 def test_actor_fetches_no_differences_of_a_large_network_or_if_told_otherwise(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch, link: LinkChoice
 ) -> None:
-    monkeypatch.setattr(snapshot_source, "_SLOW_SECONDS", 0.0)
+    monkeypatch.setattr(session_engine, "_SLOW_SECONDS", 0.0)
     if link == "auto":
-        monkeypatch.setattr(snapshot_feed, "_SMALL_BYTES", 0)
+        monkeypatch.setattr(snapshots, "_SMALL_BYTES", 0)
     learner = ScriptedLearner(network)
     learner.publish(0)
     actor = RunningActor(network, link=link)
@@ -194,7 +196,7 @@ def test_acknowledgement_is_received_while_a_snapshot_is_decoded(
     actor = RunningActor(network)
     learner.publish(0)
     _, request = learner.receive()
-    monkeypatch.setattr(learner_queries, "decode", slow_decode)
+    monkeypatch.setattr(conversation, "decode", slow_decode)
     try:
         learner.publish(1)
         assert decoding.wait(LIMIT)

@@ -21,9 +21,9 @@ LEARNER_FAULTS = {
 }
 
 ACTOR_FAULTS = {
-    "a Zenoh thread that brings an answer": "daedalus.actor.session.in_flight_rollouts:InFlightRollouts.acknowledge",
-    "a Zenoh thread that reports the learner": "daedalus.actor.session.learner_presence:LearnerPresence.on_presence",
-    "a Zenoh thread that brings a snapshot": "daedalus.actor.session.learner_presence:LearnerPresence.heard",
+    "a Zenoh thread that brings an answer": "daedalus.actor.session.uploading:InFlightRollouts.acknowledge",
+    "a Zenoh thread that reports the learner": "daedalus.actor.session.conversation:LearnerPresence.on_presence",
+    "a Zenoh thread that brings a snapshot": "daedalus.actor.session.conversation:LearnerPresence.heard",
 }
 
 

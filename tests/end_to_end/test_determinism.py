@@ -10,8 +10,8 @@ import pytest
 import safetensors.numpy
 from processes import LIMIT, Running
 
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec

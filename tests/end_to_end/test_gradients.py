@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from processes import LIMIT, until
 
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run import run_directory

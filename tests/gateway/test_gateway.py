@@ -15,7 +15,7 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
-from daedalus.actor.session.learner_queries import LearnerQueries
+from daedalus.actor.session.conversation import LearnerQueries
 from daedalus.gateway import connection, policy_versions, server
 from daedalus.gateway import gateway as gateway_module
 from daedalus.gateway.client_actor import ClientActor

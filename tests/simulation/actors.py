@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from daedalus.actor.errors import ActorError, NameInUseError
-from daedalus.actor.session.config import ActorConfig, LinkChoice
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig, LinkChoice
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces

@@ -11,7 +11,7 @@ from random import Random
 from types import ModuleType
 from typing import Any
 
-from daedalus.actor.session import runtime_maker
+from daedalus.actor.session import session_engine
 from daedalus.learner.serving import actor_server  # noqa: F401 - imports all modules that are patched
 from daedalus.protocol import codec as real_codec
 
@@ -95,7 +95,7 @@ def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
         id(threading): fakes["threading"],
         id(time): fakes["time"],
         id(queue): fakes["queue"],
-        id(runtime_maker.OnnxRuntime): Runtime,
+        id(session_engine.OnnxRuntime): Runtime,
     }
     if not settings.real_codec:
         replacements |= {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
-from daedalus.actor.session.snapshot_feed import SnapshotFeed
+from daedalus.actor.session.snapshots import SnapshotFeed
+from daedalus.actor.session.uploading import InFlightRollouts
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.rollout_judge import RolloutJudge
 from daedalus.learner.serving.sequence_window import SequenceWindow

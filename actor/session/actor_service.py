@@ -12,19 +12,18 @@ from dataclasses import replace
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.errors import ActorError, LearnerLostError
-from daedalus.actor.session.client_reports import ClientReports
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.origin import own_origin
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
-from daedalus.actor.session.runtime_maker import RuntimeMaker
-from daedalus.actor.session.session_monitor import SessionMonitor
-from daedalus.actor.session.snapshot_feed import SnapshotFeed
-from daedalus.actor.session.snapshot_source import SnapshotSource
-from daedalus.actor.session.state_lock import StateLock
-from daedalus.actor.session.upload_maker import RolloutUploadMaker, UploadMaker, make_upload_maker
-from daedalus.actor.session.upload_session import UploadSession
+from daedalus.actor.session.actor_config import ActorConfig, own_origin
+from daedalus.actor.session.conversation import LearnerPresence, LearnerQueries, RunEndWatch, RunOverError
+from daedalus.actor.session.session_engine import RuntimeMaker, SessionMonitor, SnapshotSource
+from daedalus.actor.session.session_thread import StateLock
+from daedalus.actor.session.snapshots import SnapshotFeed
+from daedalus.actor.session.uploading import (
+    ClientReports,
+    RolloutUploadMaker,
+    UploadMaker,
+    UploadSession,
+    make_upload_maker,
+)
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Join, Snapshot, Welcome

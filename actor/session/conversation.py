@@ -1,18 +1,20 @@
-"""The queries of an actor to learners: join, program, snapshot, evaluation. No state but a transport, no threads."""
+"""The conversation of every process with a learner: joining, whether the learner is there, the end of the run."""
 
 import contextlib
 import logging
 import queue
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError, NoLearnerError
-from daedalus.actor.session.run_end import DRAINED, RunEndWatch, RunOverError
+from daedalus.actor.session.session_thread import StateLock
 from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, UnfitMessageError, VersionMismatchError, decode, encode
-from daedalus.protocol.limits import LEARNER_LIMITS
+from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, LEARNER_LIMITS
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
@@ -21,13 +23,75 @@ from daedalus.protocol.messages import (
     Message,
     Program,
     Refusal,
+    RunEnded,
     Snapshot,
     Welcome,
+    starts_of,
 )
 from daedalus.protocol.spec import UnsupportedRunError
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
-from daedalus.transport.interface import RefusedError, Transport, TransportError
+from daedalus.transport.interface import Inbox, RefusedError, Transport, TransportError
 from daedalus.transport.slow_calls import SlowCall
+
+DRAINED = "an operator drained this actor: it leaves the run"
+
+
+class RunOverError(Exception):
+    """The session ends for good: the run finished, or the actor was asked to stop; the message says which."""
+
+    def __init__(self, reason: str, *, finished: bool = False) -> None:
+        """`finished`: the run finished, and an actor that stays looks for the next run."""
+        super().__init__(reason)
+        self.finished = finished
+
+
+class RunEndWatch:
+    """Watch for a local stop and for the RunEnded messages of one run after the other. For one thread."""
+
+    def __init__(self, transport: Transport, stop: threading.Event, on_news: Callable[[], None] = lambda: None) -> None:
+        """`on_news` is called on the transport's threads when a message has come."""
+        self._transport, self._stop, self._on_news = transport, stop, on_news
+        self._inboxes: dict[str, Inbox] = {}  # by run
+        self.run, self.learner_epoch = "", -1  # of the learner that is followed; an empty name before the first
+        self.learner_stopped = False  # since `follow`
+
+    def follow(self, run: str, learner_epoch: int) -> None:
+        """Follow a learner from now on."""
+        self.run, self.learner_epoch, self.learner_stopped = run, learner_epoch, False
+        if run not in self._inboxes:
+            self._inboxes[run] = self._transport.subscribe(keys.run_end(run), self._on_news)
+
+    def check(self) -> None:
+        """Raise RunOverError on a local stop or if the run finished; note if the learner was stopped."""
+        if self._stop.is_set():
+            raise RunOverError("stopped")
+        inbox = self._inboxes.get(self.run)
+        data = None if inbox is None else inbox.take()
+        if data is None:
+            return
+        try:
+            message = decode(data, ACKNOWLEDGEMENT_LIMITS)
+        except ProtocolError:
+            return
+        if isinstance(message, RunEnded):
+            self.apply(message)
+
+    def apply(self, message: RunEnded) -> None:
+        """Obey a message. Raises RunOverError if the run finished.
+
+        A later learner may have finished the run during a long rollout. An older one that was cut off, from which the
+        run was continued elsewhere, has not.
+        """
+        if message.outcome == "finished" and starts_of(message.learner_epoch) >= starts_of(self.learner_epoch):
+            raise RunOverError(f"the run is over: {bounded_text(message.reason, MAX_ANSWER_TEXT)}", finished=True)
+        if message.learner_epoch == self.learner_epoch:
+            self.learner_stopped = True
+
+    def wait(self, seconds: float) -> None:
+        """Wait, then `check`. A local stop ends the wait at once."""
+        self._stop.wait(seconds)
+        self.check()
+
 
 _logger = logging.getLogger(__name__)
 
@@ -288,3 +352,39 @@ def _raise_if_over(answers: list[Message]) -> None:
             raise RunOverError("the run is over", finished=True)
         if isinstance(answer, Refusal) and answer.code == "drained":
             raise RunOverError(DRAINED)
+
+
+class LearnerPresence:
+    """When the learner was last heard, and whether it left. The lock guards both."""
+
+    def __init__(self, lock: StateLock) -> None:
+        self._lock = lock
+        self._left = False
+        self._heard_at = 0.0
+
+    @property
+    def left(self) -> bool:
+        """Whether a learner of the run left since `joined`: the one there now may be another."""
+        return self._left
+
+    @property
+    def heard_at(self) -> float:
+        """The monotonic time of the last message of the learner."""
+        return self._heard_at
+
+    def joined(self) -> None:
+        """Forget what was known about an earlier learner: one has just answered a request to join."""
+        with self._lock:
+            self._left, self._heard_at = False, time.monotonic()
+
+    def heard(self) -> None:
+        """Note a message of the learner. From any thread."""
+        with self._lock:
+            self._heard_at = time.monotonic()
+            self._lock.announce_change()
+
+    def on_presence(self, _key: str, present: bool) -> None:
+        """Note that a learner of the run came or left. Called on the transport's threads."""
+        with self._lock:
+            self._left = self._left or not present
+            self._lock.announce_change()
