@@ -1,14 +1,15 @@
 """The full rollouts of one client on their way to the learner. For the gateway's event loop; never waits."""
 
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from daedalus.actor.session.uploading import ClientReports, UploadSession
+from daedalus.actor.session.uploading import Reports, Uploads
+from daedalus.gateway.sender import Sender
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Join, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
-from daedalus.transport.interface import QuerySender
 
 _MAX_FULL_ROLLOUTS = 8  # that wait for room in the window; beyond that the oldest is dropped
 
@@ -17,18 +18,23 @@ class ClientUploads:
     """What one client sends, to one learner epoch after the other."""
 
     def __init__(
-        self, join: Join, sender: QuerySender, uploads: UploadSession, on_rollout: Callable[["ClientUploads"], None]
+        self,
+        join: Join,
+        sender: Sender,
+        on_heard: Callable[[float], None],
+        on_rollout: Callable[["ClientUploads"], None],
     ) -> None:
         """Construct the uploads.
 
         Args:
           join: names the actor and its incarnation.
-          sender: sends the reports.
-          uploads: sends the rollouts, until they are acknowledged.
+          sender: sends the rollouts, until they are acknowledged, and the reports.
+          on_heard: called with the time of each message of the learner.
           on_rollout: called when a rollout can be sent, by `send_one`.
         """
-        self._join, self._uploads, self._on_rollout = join, uploads, on_rollout
-        self._reports = ClientReports(sender, self._report)
+        self._join, self._sender, self._on_rollout = join, sender, on_rollout
+        self._uploads = Uploads(join.actor, on_heard)
+        self._reports = Reports(self._report)
         self._session: Welcome | None = None
         self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
         self._sequence = 0  # of the next rollout
@@ -44,7 +50,8 @@ class ClientUploads:
 
     def resume(self) -> None:
         """Go on with the same learner epoch after the network failed."""
-        self._uploads.resume()
+        with self._sender.lock:
+            self._uploads.resume()
 
     def keep(self, rollout: Rollout) -> None:
         """Send a rollout once there is room in the window."""
@@ -69,15 +76,25 @@ class ClientUploads:
             sequence=self._sequence,
             learner_epoch=session.learner_epoch,
         )
-        self._uploads.send(self._sequence, encode(replace(self._full.popleft(), identity=identity)))
+        payload = encode(replace(self._full.popleft(), identity=identity))
+        with self._sender.lock:
+            self._uploads.in_flight.add(self._sequence, payload)
         self._sequence += 1
+        self._send_rollouts()
 
     def send_due(self) -> None:
         """Send again what is due, and report what the status shows of the client."""
         if self._uploads.in_flight.rollouts:
-            self._uploads.send_due()
+            self._send_rollouts()
         if self._session is not None and (self.overridden_actions or self._dropped):
-            self._reports.send_if_due(self._session.run)
+            for query in self._reports.take_due(self._session.run, time.monotonic()):
+                self._sender.send(query)
+
+    def _send_rollouts(self) -> None:
+        with self._sender.lock:
+            queries = self._uploads.take_due(time.monotonic())
+        for query in queries:
+            self._sender.send(query)
 
     def _report(self) -> ClientReport:
         return ClientReport(

@@ -3,26 +3,22 @@
 import contextlib
 import queue
 import threading
+import time
 from collections.abc import Callable
-from typing import NamedTuple
 
-from daedalus.transport.interface import OnAnswer, Transport, TransportError
+from daedalus.actor.session.conversation import Query
+from daedalus.transport.interface import Transport, TransportError
 
 _MAX_QUERIES = 1 << 17  # that wait for the thread: the windows of 2,048 clients, with 64 rollouts each
 _POLL_SECONDS = 0.2  # how soon the thread notices `close` if the queue was full
 
 
-class _Query(NamedTuple):
-    """Arguments of one `query_async`."""
-
-    key: str
-    payload: bytes
-    timeout: float
-    on_answer: OnAnswer
-
-
 class Sender:
-    """A QuerySender: a queue of queries, which the thread sends in the order of the calls."""
+    """A queue of queries, which the thread sends in the order of the calls.
+
+    Attributes:
+      lock: is held while an answer is received, on the transport's threads. Hold it to change what answers change.
+    """
 
     def __init__(self, transport: Transport, on_failure: Callable[[Exception], None]) -> None:
         """Construct the sender.
@@ -32,8 +28,9 @@ class Sender:
           on_failure: called on the thread with an error of ours, which ends it.
         """
         self._transport, self._on_failure = transport, on_failure
-        self._queue: queue.Queue[_Query | None] = queue.Queue(_MAX_QUERIES)
+        self._queue: queue.Queue[Query | None] = queue.Queue(_MAX_QUERIES)
         self._closed = threading.Event()
+        self.lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
 
     def open(self) -> None:
@@ -48,14 +45,15 @@ class Sender:
         if self._thread.is_alive():
             self._thread.join(timeout)
 
-    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
-        """See QuerySender. `timeout` begins when the thread sends the query."""
-        if self._closed.is_set():
-            raise TransportError("the gateway stops")
+    def send(self, query: Query) -> None:
+        """Send a query, soon. Without room for it, or after `close`, there is no answer."""
         try:
-            self._queue.put_nowait(_Query(key, payload, timeout, on_answer))
+            if not self._closed.is_set():
+                self._queue.put_nowait(query)
+                return
         except queue.Full:
-            raise TransportError(f"{_MAX_QUERIES:,} queries wait for the link already: try again later") from None
+            pass
+        self._answer(query, None)
 
     def _run(self) -> None:
         try:
@@ -65,10 +63,16 @@ class Sender:
         except Exception as error:  # broad: any error of ours ends the gateway
             self._on_failure(error)
 
-    def _send(self, query: _Query | None) -> None:
+    def _send(self, query: Query | None) -> None:
         if query is None:
             return
         try:
-            self._transport.query_async(query.key, query.payload, timeout=query.timeout, on_answer=query.on_answer)
+            self._transport.query_async(
+                query.key, query.payload, timeout=query.timeout, on_answer=lambda data: self._answer(query, data)
+            )
         except TransportError:
-            query.on_answer(None)
+            self._answer(query, None)
+
+    def _answer(self, query: Query, data: bytes | None) -> None:
+        with self.lock:
+            query.on_answer(data, time.monotonic())

@@ -1,17 +1,17 @@
 """What an actor uploads: rollouts or their gradients, until their final acknowledgement, and reports."""
 
+import contextlib
 import math
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
-from daedalus.actor.errors import ActorError
-from daedalus.actor.session.conversation import LearnerPresence
-from daedalus.actor.session.session_thread import StateLock
+from daedalus.actor.errors import ActorError, ActorRefusedError, LearnerLostError
+from daedalus.actor.session.conversation import DRAINED, Query, RunOverError
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
@@ -21,8 +21,9 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec, UnsupportedRunError
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.protocol.uploads import Rollout, Upload
-from daedalus.transport.interface import QuerySender, TransportError
 
+_ACKNOWLEDGEMENT_SECONDS = 30.0  # a saturated learner answers late
+_REPORT_PAUSE_SECONDS, _REPORT_ANSWER_SECONDS = 2.0, 5.0  # between two reports, and for the answer to one
 _BUSY_SECONDS = 0.005  # before the first retry after `busy`; doubles with each
 _LOST_SECONDS = 0.1  # before the first retry without any answer; doubles with each
 _MAX_RETRY_SECONDS = 0.5
@@ -41,10 +42,7 @@ class _InFlight:
 
 @dataclass(slots=True)
 class InFlightRollouts:
-    """Up to `window` rollouts, by sequence number, from collection until their final acknowledgement.
-
-    No lock: the owner guards it, because acknowledgements arrive on the transport's threads.
-    """
+    """Up to `window` rollouts, by sequence number, from collection until their final acknowledgement."""
 
     window: int
     rollouts: dict[int, _InFlight] = field(default_factory=dict)
@@ -129,125 +127,91 @@ def _retry_delay(attempts: int, *, lost: bool) -> float:
     return min(first * 2**attempts, _MAX_RETRY_SECONDS * 2 ** max(attempts - _MANY_ATTEMPTS, 0), longest)
 
 
-_ACKNOWLEDGEMENT_SECONDS = 30.0  # a saturated learner answers late
+class Uploads:
+    """The upload of rollouts to one learner after the other. State without threads, I/O or clock."""
 
-
-class UploadSession:
-    """The upload of rollouts to one learner after the other.
-
-    The lock guards `in_flight`. Its methods are for the actor's thread.
-    """
-
-    def __init__(self, sender: QuerySender, actor: str, presence: LearnerPresence, lock: StateLock) -> None:
-        self._sender, self._actor, self._presence, self._lock = sender, actor, presence, lock
+    def __init__(self, actor: str, on_heard: Callable[[float], None]) -> None:
+        """`on_heard` is called with the time of each message of the learner."""
+        self._actor, self._on_heard = actor, on_heard
         self.run = ""  # the name of the learner's run
         self.in_flight = InFlightRollouts(window=1)
 
     def begin(self, run: str, window: int) -> None:
         """Begin with a learner that has no rollouts of this actor yet; keep up to `window` in flight."""
-        with self._lock:
-            self.run, self.in_flight = run, InFlightRollouts(window)
+        self.run, self.in_flight = run, InFlightRollouts(window)
 
     def resume(self) -> None:
         """Continue with the same learner after the network failed."""
-        with self._lock:
-            self.in_flight.resend_all()
+        self.in_flight.resend_all()
 
-    def size_window(self, collect_seconds: float, least: int, most: int) -> None:
-        """See InFlightRollouts."""
-        with self._lock:
-            self.in_flight.size_window(collect_seconds, least, most)
+    def take_due(self, now: float) -> list[Query]:
+        """Return the queries of all rollouts that are due, for the first time or again."""
+        in_flight, key = self.in_flight, keys.rollouts(self.run, self._actor)
+        return [
+            Query(key, payload, _ACKNOWLEDGEMENT_SECONDS, partial(self._on_answer, in_flight, sequence))
+            for sequence, payload in in_flight.take_due(now)
+        ]
 
-    def send(self, sequence: int, payload: bytes) -> None:
-        """Send an encoded rollout; `send_due` repeats it until its final acknowledgement."""
-        with self._lock:
-            self.in_flight.add(sequence, payload)
-        self.send_due()
+    def check(self) -> None:
+        """Raise if a verdict ended the session.
 
-    def send_due(self) -> None:
-        """Send every rollout that is due, for the first time or again."""
-        in_flight = self.in_flight
-        with self._lock:
-            due = in_flight.take_due(time.monotonic())
-        for sequence, payload in due:
-            try:
-                self._sender.query_async(
-                    keys.rollouts(self.run, self._actor),
-                    payload,
-                    timeout=_ACKNOWLEDGEMENT_SECONDS,
-                    on_answer=lambda answer, sequence=sequence: self._on_answer(in_flight, sequence, answer),
-                )
-            except TransportError:
-                self._on_answer(in_flight, sequence, None)
+        Raises RunOverError if the run or the actor is over, ActorRefusedError in quarantine, and LearnerLostError if
+        the learner does not accept rollouts of this learner epoch any more.
+        """
+        self.check_over()
+        if self.in_flight.ended_by == "fenced":
+            raise LearnerLostError
 
-    def clear_rejection(self) -> None:
-        """Forget that the last rollout was rejected: the actor is about to collect its replacement."""
-        with self._lock:
-            self.in_flight.last_was_rejected = False
+    def check_over(self) -> None:
+        """Raise as `check` does, unless the actor may join again."""
+        ended_by = self.in_flight.ended_by
+        if ended_by == "quarantined":
+            reason = self.in_flight.reason
+            raise ActorRefusedError(
+                f"the learner quarantined this actor: {reason}; fix the cause and restart the actor"
+            )
+        if ended_by == "finished":
+            raise RunOverError("the run is over", finished=True)
+        if ended_by == "drained":
+            raise RunOverError(DRAINED)
 
-    @property
-    def rejections(self) -> tuple[int, str]:
-        """How many of the last final acknowledgements in a row were rejections, and the reason in the last one."""
-        with self._lock:
-            return self.in_flight.rejections_in_a_row, self.in_flight.reason
-
-    def _on_answer(self, in_flight: InFlightRollouts, sequence: int, data: bytes | None) -> None:
-        """Receive an answer, or None without one. Called on the transport's threads."""
-        try:
-            answer = None if data is None else decode(data, ACKNOWLEDGEMENT_LIMITS)
-        except ProtocolError:
-            answer = None
-        with self._lock:
-            if data is not None:
-                self._presence.heard()
-            acknowledgement = answer if isinstance(answer, Acknowledgement) else None
-            in_flight.acknowledge(sequence, acknowledgement, time.monotonic())
-            self._lock.announce_change()
+    def _on_answer(self, in_flight: InFlightRollouts, sequence: int, data: bytes | None, now: float) -> None:
+        """Receive an answer, or None without one."""
+        answer = None
+        if data is not None:
+            self._on_heard(now)
+            with contextlib.suppress(ProtocolError):
+                answer = decode(data, ACKNOWLEDGEMENT_LIMITS)
+        in_flight.acknowledge(sequence, answer if isinstance(answer, Acknowledgement) else None, now)
 
 
-_REPORT_PAUSE_SECONDS = 2.0  # between two reports
-_REPORT_ANSWER_SECONDS = 5.0
+class Reports:
+    """What a client counts about itself, for the status: reports to one learner after the other."""
 
-
-class ClientReports:
-    """The reports of one client to one learner after the other."""
-
-    def __init__(self, sender: QuerySender, report: Callable[[], ClientReport]) -> None:
+    def __init__(self, report: Callable[[], ClientReport]) -> None:
         """`report` returns the counts so far."""
-        self._sender, self._report = sender, report
+        self._report = report
         self._sent: ClientReport | None = None
-        self._next_at = 0.0
+        self.next_at = 0.0
 
     def begin(self) -> None:
         """Begin with another learner, which knows no counts."""
-        self._sent, self._next_at = None, 0.0
+        self._sent, self.next_at = None, 0.0
 
-    def send_if_due(self, run: str) -> None:
-        """Send the counts if they have changed since the last report, and that was a while ago."""
-        now = time.monotonic()
-        if now < self._next_at:
-            return
-        self._next_at = now + _REPORT_PAUSE_SECONDS
+    def take_due(self, run: str, now: float) -> list[Query]:
+        """Return a report of the counts, if they have changed since the last report, and that was a while ago."""
+        if now < self.next_at:
+            return []
+        self.next_at = now + _REPORT_PAUSE_SECONDS
         report = self._report()
-        if report != self._sent:
-            self.send(run, report)
-
-    def send(self, run: str, report: ClientReport) -> None:
-        """Send a report. One that is lost is sent again later."""
+        if report == self._sent:
+            return []
         self._sent = report
-        try:
-            self._sender.query_async(
-                keys.reports(run, report.actor),
-                encode(report),
-                timeout=_REPORT_ANSWER_SECONDS,
-                on_answer=self._on_answer,
-            )
-        except TransportError:
-            self._sent = None
+        return [Query(keys.reports(run, report.actor), encode(report), _REPORT_ANSWER_SECONDS, self._on_answer)]
 
-    def _on_answer(self, data: bytes | None) -> None:
+    def _on_answer(self, data: bytes | None, _now: float) -> None:
         if data is None:
-            self._sent = None
+            self._sent = None  # a report that is lost is sent again later
 
 
 class UploadMaker(Protocol):

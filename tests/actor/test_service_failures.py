@@ -10,12 +10,15 @@ from log_lines import LINES
 from processes import LIMIT, until
 from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
 
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session import actor_service, conversation, session_engine
-from daedalus.actor.session.conversation import RunEndWatch, RunOverError
+from daedalus.actor.session import conversation, session_engine
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.conversation import Conversation, RunOverError
+from daedalus.actor.session.session_thread import SessionThread
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
-from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome, new_epoch
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, Welcome, new_epoch
 from daedalus.transport.interface import RefusedError, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -62,7 +65,7 @@ def test_drained_actor_ends(
     network: MemoryNetwork, actor: RunningActor, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The join is refused if the actor sends nothing, because it waits for the other actors of a2c."""
-    monkeypatch.setattr(session_engine, "_SILENCE_SECONDS", 1e6 if how == "verdict" else 0.1)
+    monkeypatch.setattr(conversation, "_SILENCE_SECONDS", 1e6 if how == "verdict" else 0.1)
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
@@ -134,7 +137,7 @@ def test_unexpected_error_is_reported_with_its_type(network: MemoryNetwork, monk
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a fault of a simulator")
 
-    monkeypatch.setattr(actor_service.ActorService, "_collect", fail)
+    monkeypatch.setattr(EnvironmentCollector, "collect", fail)
     learner = ScriptedLearner(network)
     actor = RunningActor(network)
     learner.publish(0)
@@ -202,25 +205,21 @@ def test_an_older_learner_that_does_not_step_down_is_not_waited_for(
 ) -> None:
     monkeypatch.setattr(conversation, "_STEP_DOWN_SECONDS", 0.05)
     older, newer = ScriptedLearner(network, epoch=new_epoch(1)), ScriptedLearner(network, epoch=new_epoch(2))
-    transport = MemoryTransport(network)
-    end = RunEndWatch(transport, threading.Event())
-    join = Join(actor="a", incarnation=1)
-    welcome = conversation.LearnerQueries(transport).join_learner("*", join, None, end)
+    talk = Conversation(ActorConfig(name="a", incarnation=1))
+    welcome = SessionThread(talk, MemoryTransport(network), threading.Event()).run(talk.find_learner())
     assert welcome.learner_epoch == newer.epoch
     assert older.epoch < newer.epoch
 
 
 @pytest.mark.parametrize(("starts", "is_over"), [(1, False), (2, True), (3, True)])
-def test_only_an_older_learner_cannot_say_that_the_run_is_over(
-    network: MemoryNetwork, starts: int, is_over: bool
-) -> None:
+def test_only_an_older_learner_cannot_say_that_the_run_is_over(starts: int, is_over: bool) -> None:
     """Two processes that resumed from the same checkpoint differ in random bits only: either may end the run."""
-    end = RunEndWatch(MemoryTransport(network), threading.Event())
-    end.follow("r", new_epoch(2))
+    talk = Conversation(ActorConfig(name="a", incarnation=1))
+    talk.run, talk.learner_epoch = "r", new_epoch(2)
     finished = RunEnded(learner_epoch=new_epoch(starts), outcome="finished", reason="solved")
-    MemoryTransport(network).publish(keys.run_end("r"), encode(finished))
+    talk.received(keys.run_end("r"), encode(finished))
     with pytest.raises(RunOverError) if is_over else contextlib.nullcontext():
-        end.check()
+        talk.check()
 
 
 @pytest.mark.parametrize("others", [0, 1])
@@ -325,7 +324,7 @@ def test_consecutive_rejections_are_warned_of_once_with_the_reason(network: Memo
 def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
     network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_engine, "_SILENCE_SECONDS", 0.1)
+    monkeypatch.setattr(conversation, "_SILENCE_SECONDS", 0.1)
     learner = ScriptedLearner(network)
     learner.publish(0)
     held = [learner.receive(), learner.receive()]  # never answered

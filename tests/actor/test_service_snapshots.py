@@ -10,7 +10,7 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.actor.session import actor_service, conversation, session_engine, snapshots
+from daedalus.actor.session import conversation, session_engine, snapshots
 from daedalus.actor.session.actor_config import LinkChoice
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
@@ -25,9 +25,7 @@ def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(networ
     actor = RunningActor(network, link="wan")
     learner = ScriptedLearner(network)
     learner.publish(3)
-    received = [
-        learner.receive() for _ in range(actor_service._SLOW_LINK_WINDOW)
-    ]  # a dropped one is sent again
+    received = [learner.receive() for _ in range(session_engine._SLOW_LINK_WINDOW)]  # a dropped one is sent again
     assert [rollout.policy_version for rollout, _ in received] == [3] * len(received)
     assert [rollout.identity.sequence for rollout, _ in received] == list(range(len(received)))
     assert learner.rollouts.empty()
@@ -158,11 +156,8 @@ def test_actor_plays_with_its_snapshot_if_a_fetch_has_no_answer(network: MemoryN
 class SlowClient(EnvironmentCollector):
     """A collector whose rollouts are complete only after weights of version 1 came."""
 
-    def has_rollout(self) -> bool:
-        return self._policy_version >= 1
-
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None]) -> Rollout | None:  # type: ignore[override] - as Collector has it
-        return super().collect(identity, on_row) if self.has_rollout() else None
+        return super().collect(identity, on_row) if self._policy_version >= 1 else None
 
 
 def test_newer_weights_are_loaded_while_a_rollout_is_incomplete(network: MemoryNetwork) -> None:

@@ -22,8 +22,8 @@ LEARNER_FAULTS = {
 
 ACTOR_FAULTS = {
     "a Zenoh thread that brings an answer": "daedalus.actor.session.uploading:InFlightRollouts.acknowledge",
-    "a Zenoh thread that reports the learner": "daedalus.actor.session.conversation:LearnerPresence.on_presence",
-    "a Zenoh thread that brings a snapshot": "daedalus.actor.session.conversation:LearnerPresence.heard",
+    "a Zenoh thread that reports the learner": "daedalus.actor.session.conversation:Conversation.presence_changed",
+    "a Zenoh thread that brings a snapshot": "daedalus.actor.session.snapshots:SnapshotFetcher._on_answer",
 }
 
 

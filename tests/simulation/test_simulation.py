@@ -115,7 +115,7 @@ def drops_without_an_answer(patch: pytest.MonkeyPatch) -> None:
 
 
 def requests_no_lost_snapshot(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(SnapshotFeed, "request_newest", lambda _feed: None)
+    patch.setattr(SnapshotFeed, "request_newest", lambda _feed: ())
 
 
 @pytest.mark.parametrize(
