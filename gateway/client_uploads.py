@@ -1,5 +1,6 @@
 """The full rollouts of one client on their way to the learner. For the gateway's event loop; never waits."""
 
+import asyncio
 import time
 from collections import deque
 from collections.abc import Callable
@@ -113,3 +114,30 @@ class ClientUploads:
     def ended_by(self) -> tuple[str, str]:
         """The verdict that ended the session, and the reason; both empty while it goes on."""
         return self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
+
+
+class Outbox:
+    """The clients that have a rollout to send.
+
+    Encoding takes longer than the choice of an action, and clients that began together fill their rollouts together. So
+    each turn of the event loop encodes one rollout for the sender (sender.py), and answers clients between them.
+    """
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._ready: dict[ClientUploads, None] = {}  # in the order in which they are sent
+
+    def add(self, uploads: ClientUploads) -> None:
+        """Send the rollouts of a client, soon."""
+        if not self._ready:
+            self._loop.call_soon(self._send_one)
+        self._ready[uploads] = None
+
+    def _send_one(self) -> None:
+        uploads = next(iter(self._ready))
+        del self._ready[uploads]
+        uploads.send_one()
+        if uploads.can_send:
+            self._ready[uploads] = None
+        if self._ready:
+            self._loop.call_soon(self._send_one)

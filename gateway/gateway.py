@@ -16,17 +16,14 @@ from typing import Any
 
 from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.gateway.batcher import Batcher
-from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.client_actor import ClientActor, ParkedActors
 from daedalus.gateway.client_spaces import ClientSpaces
-from daedalus.gateway.client_uploads import ClientUploads
+from daedalus.gateway.client_uploads import ClientUploads, Outbox
 from daedalus.gateway.config import GatewayConfig
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.followed_run import FollowedRun
-from daedalus.gateway.joining import Joining, Seat
+from daedalus.gateway.joining import FollowedRun, Joining, Seat
 from daedalus.gateway.learner_link import LearnerLink, LinkSession, NewestPolicy
 from daedalus.gateway.messages import Act, Hello
-from daedalus.gateway.outbox import Outbox
-from daedalus.gateway.parked_actors import ParkedActors
 from daedalus.gateway.policy_versions import PolicyVersion, PolicyVersions
 from daedalus.gateway.sender import Sender
 from daedalus.protocol.messages import Join, Origin, Welcome

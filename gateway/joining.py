@@ -1,6 +1,7 @@
 """Lets clients take part in the run: requests to join its learner. For the gateway's event loop, with threads."""
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,11 +14,77 @@ from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.conversation import Ask, Conversation, DeclarePresence, RunOverError, Steps, Wait, Work
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.followed_run import FollowedRun
 from daedalus.gateway.learner_link import LearnerLink
-from daedalus.gateway.presence import Presence
 from daedalus.protocol.messages import Welcome
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.interface import Declaration, Transport, TransportError
+
+
+class Presence:
+    """Declares and withdraws the presence of one actor.
+
+    A congested link makes both wait. So one thread performs them for all actors, in the order of the calls.
+    """
+
+    def __init__(self, transport: Transport, thread: ThreadPoolExecutor) -> None:
+        """`thread` has one worker."""
+        self._transport, self._thread = transport, thread
+        self._key = ""  # that is declared; this and the next are the thread's
+        self._declaration: Declaration | None = None
+
+    async def declare(self, key: str) -> None:
+        """Be present under one key, and no other. Raises TransportError.
+
+        If the call is cancelled, the key may be declared all the same: call `withdraw`.
+        """
+        await asyncio.get_running_loop().run_in_executor(self._thread, self._declare, key)
+
+    def withdraw(self) -> None:
+        """Be present no longer. Returns at once."""
+        with contextlib.suppress(RuntimeError):  # the thread has ended: the transport withdraws it when it is closed
+            asyncio.get_running_loop().run_in_executor(self._thread, self._withdraw)
+
+    def _declare(self, key: str) -> None:
+        if self._key != key:
+            self._withdraw()
+            self._declaration = self._transport.declare_presence(key)
+            self._key = key
+
+    def _withdraw(self) -> None:
+        declaration, self._declaration, self._key = self._declaration, None, ""
+        if declaration is not None:
+            declaration.close()
+
+
+class FollowedRun:
+    """The learner of the run, and how the last run ended."""
+
+    def __init__(self) -> None:
+        self.session: Welcome | None = None  # of the learner that is followed
+        self.name = ""  # of the run that is or was followed
+        self.last_end = ""  # how the last run ended, until another begins
+        self.on_change: Callable[[], None] = lambda: None  # called when a learner was found, or a run has ended
+        self._changed = asyncio.Event()
+
+    def begin(self, session: Welcome) -> None:
+        """Follow a learner."""
+        self.session, self.name, self.last_end = session, session.run, ""
+        self.announce()
+        self.on_change()
+
+    def end(self, reason: str) -> None:
+        """Note that the run has ended."""
+        self.session, self.last_end = None, reason
+        self.on_change()
+
+    def announce(self) -> None:
+        """Wake those that wait for a change."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    async def change(self) -> None:
+        """Wait for another learner, or for a policy."""
+        await self._changed.wait()
+
 
 _THREADS = 16  # requests at the same time, which may wait
 _RETRY_SECONDS = 0.2  # how soon a client that joins notices that another learner is followed

@@ -5,6 +5,7 @@ The only threads are the caller's, which `run` occupies, and the transport's.
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -100,7 +101,10 @@ class ActorService:
         return None
 
     def _on_row(self) -> None:
-        self._thread.call(self._session.on_row)
+        if self._session.is_fetch_due(time.monotonic()):
+            self._thread.call(self._session.fetch_next)
+        else:
+            self._thread.call_after_events(self._session.check_over)
 
     def _runtime(self, begin: Begin) -> PolicyRuntime:
         """Return the runtime of the policy."""

@@ -59,7 +59,10 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Collect:
-    """Send back the next rollout, or None if a client has not filled it. Call `ActorSession.on_row` before each row."""
+    """Send back the next rollout, or None if a client has not filled it.
+
+    Before each row, call `ActorSession.check_over`, and `fetch_next` if `is_fetch_due`.
+    """
 
     identity: RolloutIdentity
 
@@ -338,7 +341,8 @@ class ActorSession(PolicySession):
         self.rollout_ready = False
         while (rollout := (yield Collect(identity))) is None:
             if not (yield from self.wait(lambda: self.rollout_ready, _REFRESH_SECONDS)):
-                self._fetch_if_due()
+                if self.is_fetch_due(self.now):
+                    self.fetch_next()
                 self.check()
                 yield from self._read()
                 yield self._load()
@@ -347,14 +351,17 @@ class ActorSession(PolicySession):
         self._slow_rollouts = self._slow_rollouts + 1 if self._schedule.rollout_seconds > _SLOW_SECONDS else 0
         return rollout
 
-    def on_row(self) -> None:
-        """Request the next snapshot if this rollout is about to end. Raises as `check_over` does."""
-        self.check_over()
-        self._fetch_if_due()
+    def is_fetch_due(self, now: float) -> bool:
+        """Return whether this rollout is about to end, so that `fetch_next` is due. Call this before each row.
 
-    def _fetch_if_due(self) -> None:
-        """Request the snapshot of the next rollout, if this one is about to end and the next can begin at once."""
-        if self._schedule.is_due(self.now) and self.uploads.in_flight.has_room_for(2):
+        No event changes what this method reads: it is no step.
+        """
+        return self._schedule.is_due(now)
+
+    def fetch_next(self) -> None:
+        """Request the snapshot of the next rollout, if that can begin at once. Raises as `check_over` does."""
+        self.check_over()
+        if self.uploads.in_flight.has_room_for(2):
             self.feed.fetch()
 
     def _warn_of_rejections(self) -> None:

@@ -145,7 +145,7 @@ def test_verdict_ends_a_rollout_that_is_being_collected(verdict: str) -> None:
     answer = encode(Acknowledgement(verdict=verdict, reason="why"))  # type: ignore[arg-type] - one of its literals
     played.event(rollouts(played)[0].on_answer, answer, played.now)
     with pytest.raises(ActorRefusedError if verdict == "quarantined" else RunOverError):
-        played.session.on_row()
+        played.session.check_over()
 
 
 @pytest.mark.parametrize(("starts", "is_over"), [(1, False), (2, True), (3, True)])

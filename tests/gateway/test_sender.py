@@ -10,7 +10,7 @@ import pytest
 from processes import LIMIT
 
 from daedalus.actor.session.conversation import Query
-from daedalus.gateway.presence import Presence
+from daedalus.gateway.joining import Presence
 from daedalus.gateway.sender import Sender
 from daedalus.transport.interface import OnAnswer, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport

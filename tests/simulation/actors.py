@@ -291,7 +291,7 @@ class ActorProcess:
         return None, True
 
     def _make_row(self) -> None:
-        self._step(self.session.on_row)
+        self._step(self.session.fetch_next if self.session.is_fetch_due(self._now) else self.session.check_over)
 
     def _end_rollout(self, identity: RolloutIdentity) -> None:
         if not self.outcome:
