@@ -3,15 +3,15 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs check format lock clean
+.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs docs-reference check format lock clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
-# Four processes share the tests, also on two cores: many tests wait for the processes that they start. The tests of one
-# file run in one process, because they share what they start.
+# Six processes share the tests, also on two cores: many tests wait for the processes that they start, and their files come
+# first. The tests of one file run in one process, because they share what they start.
 test: check
-	$(BIN)/pytest --numprocesses 4 --dist loadfile
+	$(BIN)/pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder
 
 # Trackio needs an older pillow than constraints.txt: for its test it is installed into a folder of its own.
 test-trackio: .venv/ready-test
@@ -65,8 +65,18 @@ mutants: .venv/ready-test
 	cd build/mutants && ../../$(BIN)/mutmut export-cicd-stats && ../../$(BIN)/python tests/mutants.py
 
 # The documentation site, in build/site: open index.html there.
-docs: .venv/ready-test
+docs: .venv/ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The parts of the documentation that are made from the code: a test fails while they differ.
+docs-reference: .venv/ready-train
+	$(BIN)/python docs/generate_reference.py
+	$(BIN)/python docs/trace_rollout.py
+
+.venv/ready-docs: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(PIP) -e ".[docs]"
+	touch $@
 
 # torch first, with its exact version: on some indexes a range would select the CUDA build.
 .venv/ready-train: pyproject.toml constraints.txt

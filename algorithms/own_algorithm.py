@@ -5,14 +5,14 @@ from typing import Any
 
 import torch
 
+from daedalus.algorithms import action_values, policy_gradient
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.algorithms.errors import AlgorithmError
-from daedalus.policy.network.components import map_components
-from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.network.action_distribution import ActionDistribution
+from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_code import first_line, place_of
-from daedalus.policy.user_modules import UserModuleError, UserModules
-from daedalus.protocol.algorithms import AlgorithmRecord
+from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
+from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmError, AlgorithmRecord, is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec
 
@@ -83,3 +83,25 @@ def check_updates(
 
 def _fault(name: str, error: Exception) -> AlgorithmError:
     return AlgorithmError(f"{_SETTING}={name}: {first_line(error)}{place_of(error)}")
+
+
+def _built_in() -> Iterator[tuple[str, type[Algorithm]]]:
+    """Yield the classes of the built-in algorithms, each by the name of its record."""
+    names = {id(record): name for name, record in ALGORITHMS.items()}
+    for module in (policy_gradient, action_values):
+        for kind in vars(module).values():
+            if isinstance(kind, type) and (name := names.get(id(vars(kind).get("record")))):
+                yield name, kind
+
+
+CLASSES = dict(_built_in())
+
+
+def build_algorithm(spec: LossSpec, distribution: ActionDistribution, modules: UserModules = NO_MODULES) -> Algorithm:
+    """Return the algorithm named by `spec.algorithm`, for a policy with these action distributions.
+
+    `modules` may be imported. Raises AlgorithmError for an algorithm of the user's own that cannot be constructed.
+    """
+    if is_own(spec.algorithm):
+        return own_algorithm(spec, distribution, modules)
+    return CLASSES[spec.algorithm](spec, distribution)

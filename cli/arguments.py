@@ -9,8 +9,6 @@ from pathlib import Path
 
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_words
 
-MOST_PROCESSES = 256  # of a learner
-
 
 def command_parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
     """Return the parser of `daedalus NAME`. Its help ends with the examples, printed as they are written."""
@@ -45,23 +43,6 @@ def add_reset_statistics(options: argparse._ActionsContainer, only: str = "") ->
         help=f"{only}forget the sizes of observations and rewards that the checkpoint has, which the next rollouts "
         "then define anew: for a run that a broken sensor has spoiled",
     )
-
-
-def add_processes(options: argparse._ActionsContainer) -> None:
-    """Add --processes, the number of processes of a learner; None if it is not given."""
-    options.add_argument(
-        "--processes",
-        type=_processes,
-        metavar="N",
-        help="processes of the learner on this machine, each with training.threads threads, or with a GPU of its own. "
-        "Each computes the gradients of its share of every batch (default: 1)",
-    )
-
-
-def _processes(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= MOST_PROCESSES:
-        raise argparse.ArgumentTypeError(f"{text} is not a number from 1 to {MOST_PROCESSES}")
-    return int(text)
 
 
 def whole_number(text: str) -> int:

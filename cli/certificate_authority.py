@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from daedalus.policy.saving.replacing import replacing
+from daedalus.policy.saving.regular_files import replacing
 from daedalus.transport.credentials import CA, CERTIFICATE, KEY, CredentialsError
 
 _HOSTS = x509.SubjectAlternativeName

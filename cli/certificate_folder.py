@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daedalus.cli.certificate_authority import CertificateAuthority, Issued, read_issued
-from daedalus.policy.saving.replacing import replace_text
+from daedalus.policy.saving.regular_files import replace_text
 from daedalus.protocol import keys
 from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, Credentials, CredentialsError

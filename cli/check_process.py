@@ -19,7 +19,7 @@ from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
 if TYPE_CHECKING:
-    from daedalus.actor.checking.report import EnvironmentReport
+    from daedalus.actor.checking.check_report import EnvironmentReport
 
 _POLL_SECONDS = 0.2
 _ALARM_SECONDS = 5  # after the limit: a process without its parent ends then, even in native code
@@ -88,7 +88,7 @@ def check_in_process(
 
     Raises CheckTimeoutError.
     """
-    from daedalus.actor.checking.report import EnvironmentReport
+    from daedalus.actor.checking.check_report import EnvironmentReport
 
     reading, writing = os.pipe()
     with open(reading, "rb", buffering=0) as results:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import UserModules

@@ -11,8 +11,8 @@ import shutil
 import time
 from pathlib import Path
 
-from daedalus.gateway.tokens import OPERATOR, TOKENS, digest, new_token
-from daedalus.policy.saving.replacing import replace_text
+from daedalus.gateway.security import OPERATOR, TOKENS, digest, new_token
+from daedalus.policy.saving.regular_files import replace_text
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CA, CredentialsError
 

@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.cli.arguments import (
-    MOST_PROCESSES,
     add_allow_module,
     add_insecure,
-    add_processes,
     add_reset_statistics,
     add_tls,
     command_parser,
@@ -19,10 +17,10 @@ from daedalus.cli.arguments import (
 )
 from daedalus.cli.logs import add_logging
 from daedalus.cli.own_algorithm import with_record
-from daedalus.learner.reporting.trackers.tracker import TRACKERS
+from daedalus.learner.reporting.trackers.tracker import TRACKERS, tracker_name
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.changes import differing, fixed_changes
 from daedalus.learner.run.default_settings import default_settings
+from daedalus.learner.run.resuming import differing, fixed_changes
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.algorithms import ALGORITHMS
@@ -42,7 +40,6 @@ examples:
   daedalus learner --env Acrobot-v1 --set training.learning_rate=0.001 --run-dir runs/acrobot
   daedalus learner cartpole --listen tls/0.0.0.0:7447 --tls certs/learner      (daedalus certs --help)
   daedalus learner cartpole --connect tcp/router:7447
-  daedalus learner car_racing_article --processes 2
   daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
   daedalus learner --run-dir runs/mine --resume --env-steps 3000000      (the whole budget, with the steps already done)
 
@@ -119,10 +116,19 @@ def add_log(options: argparse._ActionsContainer) -> None:
         "--log",
         action="append",
         default=[],
-        choices=TRACKERS,
-        help="log the run to this tracker too, in addition to metrics.csv and TensorBoard. May be given several times. "
-        "`daedalus resume` continues the run there",
+        type=_tracker_name,
+        metavar="NAME",
+        help=f"log the run to this tracker too ({', '.join(TRACKERS)}), in addition to metrics.csv and TensorBoard, or "
+        "to a metrics writer of your own (module:Class). May be given several times. `daedalus resume` continues the "
+        "run at a tracker by itself",
     )
+
+
+def _tracker_name(name: str) -> str:
+    try:
+        return tracker_name(name)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def resolve(arguments: argparse.Namespace, defaults: dict[str, Any] | None = None) -> tuple[RunSpec, Path]:
@@ -210,17 +216,6 @@ def check_environment(env: str | None, settings: dict[str, Any]) -> None:
     """Check that other settings name no other environment than `env`. Raises SettingsError."""
     if env is not None and (chosen := settings["environment"].get("id")) != env:
         raise SettingsError(f"--env {env} and environment.id={chosen} are two environments: leave one of them out")
-
-
-def check_processes(number: int, spec: RunSpec) -> None:
-    """Raise SettingsError if a learner of so many processes cannot learn what `spec` defines."""
-    if number > 1 and spec.uploads_gradients:
-        raise SettingsError(
-            "collection.upload is gradients: the actors compute them, so that several processes of the learner would "
-            "have nothing to do; leave out --processes, or set collection.upload=rollouts"
-        )
-    if not 1 <= number <= MOST_PROCESSES:
-        raise SettingsError(f"the learner cannot have {number} processes: choose a number from 1 to {MOST_PROCESSES}")
 
 
 def named_directory(preset: str | None, spec: RunSpec) -> Path:
@@ -317,7 +312,6 @@ def learner_parser() -> argparse.ArgumentParser:
         "For a supervisor that repeats the same command. Another --env-steps or --set changes the run from then on",
     )
     add_reset_statistics(options, "with --resume: ")
-    add_processes(options)
     add_allow_module(options, "config.toml of an existing run")
     add_tls(options)
     add_insecure(options)

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from numbers import Integral
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -21,9 +20,9 @@ from daedalus.cli.running.local_run import LocalRun, RunEnd, RunFailedError, Uns
 from daedalus.cli.running.new_run import prepare
 from daedalus.cli.running.run_locally import run_locally
 from daedalus.cli.settings_arguments import Choice, named_directory
-from daedalus.learner.reporting.trackers.tracker import TRACKERS
+from daedalus.learner.reporting.trackers.tracker import tracker_name
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.initial import check_initial
+from daedalus.learner.run.resuming import check_initial
 from daedalus.learner.run.settings import SettingsError, assign
 from daedalus.policy.user_modules import refuse_while_imported
 
@@ -69,7 +68,6 @@ def train(
     wrap: str | None = None,
     init_from: str | Path | None = None,
     allow_other_spaces: bool = False,
-    processes: int = 1,
     callback: Callback | None = None,
     log: str | Sequence[str] = (),
     quiet: bool = False,
@@ -92,9 +90,9 @@ def train(
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
       init_from: another run, or one of its checkpoints, whose weights to begin with, of equal network and spaces.
       allow_other_spaces: accept `init_from` of other spaces: the weights are loaded if their shapes fit.
-      processes: of the learner; each computes the gradients of its share of every batch.
       callback: called with each row of metrics; it can log metrics of its own and end training.
-      log: trackers to log the run to, of "wandb", "mlflow" and "trackio".
+      log: trackers to log the run to, of "wandb", "mlflow" and "trackio", or "module:Class" for a metrics writer of
+        your own.
       quiet: print nothing.
 
     Raises SettingsError for invalid settings, TypeError for an argument of another type, TrainingError if a process
@@ -103,10 +101,12 @@ def train(
     started = time.monotonic()
     refuse_while_imported("daedalus.train")
     preset = str(preset) if isinstance(preset, Path) else preset
-    _check_types(preset, env, callback, settings, processes)
+    _check_types(preset, env, callback, settings)
     log = (log,) if isinstance(log, str) else log
-    if unknown := set(log) - set(TRACKERS):
-        raise SettingsError(f"log: unknown tracker {sorted(unknown)[0]!r}: choose from {', '.join(TRACKERS)}")
+    try:
+        log = [tracker_name(name) for name in log]
+    except ValueError as error:
+        raise SettingsError(f"log: {error}") from None
     choice = Choice(
         preset=preset, env=env, algorithm=algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap
     )
@@ -116,7 +116,7 @@ def train(
     if run_dir is not None:
         run_directory.check_free(Path(run_dir))  # before the environment is made
     with _checking(quiet):
-        spec, spaces = prepare(resolved, env=env, processes=int(processes))
+        spec, spaces = prepare(resolved, env=env)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     with (
         run_directory.create_locked(
@@ -132,14 +132,13 @@ def train(
             spaces=spaces,
             init_from=weights,
             log=tuple(log),
-            processes=processes,
             observer=observer,
         )
         end = _run(run, quiet)
     return _result(lock.directory, end, control.stop_reason)
 
 
-def _check_types(preset: object, env: object, callback: object, settings: object, processes: object) -> None:
+def _check_types(preset: object, env: object, callback: object, settings: object) -> None:
     """Raise TypeError for objects that are often given in place of a name, or of an instance."""
     for name in (preset, env):
         if not isinstance(name, str | None):
@@ -148,8 +147,6 @@ def _check_types(preset: object, env: object, callback: object, settings: object
         raise TypeError(f"callback must be an instance of a subclass of daedalus.Callback, not {callback}")
     if not isinstance(settings, Mapping | None) or not all(isinstance(path, str) for path in settings or ()):
         raise TypeError(f'settings must be a map such as {{"training.learning_rate": 0.001}}, not {settings!r}')
-    if not isinstance(processes, Integral):
-        raise TypeError(f"processes must be a whole number, not {processes!r}")
 
 
 def _assign(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:

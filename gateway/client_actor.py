@@ -1,7 +1,7 @@
 """One client as an actor towards the learner: its rows and its rollouts. For the gateway's event loop."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,16 +10,14 @@ import numpy as np
 from daedalus.actor.collecting.client_rows import ClientRows, check_run, finished_copy, make_client_rows
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.masks import mask_of_one
+from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.errors import ActorError
-from daedalus.gateway.client_images import check_images
-from daedalus.gateway.client_spaces import ClientSpaces
+from daedalus.gateway.client_messages import Act, ClientError, EndEpisode
+from daedalus.gateway.client_spaces import ClientSpaces, check_images
 from daedalus.gateway.client_uploads import ClientUploads
-from daedalus.gateway.errors import ClientError
-from daedalus.gateway.messages import Act, EndEpisode
 from daedalus.gateway.policy_versions import PolicyVersion
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.spec import ActorSpec
@@ -195,47 +193,3 @@ class ClientActor:
 
 def _ignore(action: Any) -> None:
     """Receive an action that no client waits for."""
-
-
-_PARKED_SECONDS = 60.0  # for which a client may return
-
-
-class ParkedActors:
-    """Up to a number of actors; the one that has been absent longest goes first."""
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._actors: dict[str, tuple[float, ClientActor]] = {}  # by name, the oldest first
-
-    def __iter__(self) -> Iterator[ClientActor]:
-        return (actor for _, actor in self._actors.values())
-
-    def park(self, actor: ClientActor) -> None:
-        """Keep an actor whose client has disconnected."""
-        self._actors[actor.name] = time.monotonic(), actor
-        if len(self._actors) > self._most:
-            self.release_oldest()
-
-    def take(self, name: str, spaces: ClientSpaces) -> ClientActor | None:
-        """Return the actor of a client that returns with the same spaces."""
-        _, actor = self._actors.pop(name, (0.0, None))
-        if actor is not None and actor.spaces.stated != spaces.stated:
-            actor.release()
-            return None
-        return actor
-
-    def release_oldest(self) -> None:
-        """Release the actor that has been absent longest, if there is one."""
-        if self._actors:
-            _, actor = self._actors.pop(next(iter(self._actors)))
-            actor.release()
-
-    def release_late(self, now: float) -> None:
-        """Release those that did not return in time."""
-        while self._actors and now > next(iter(self._actors.values()))[0] + _PARKED_SECONDS:
-            self.release_oldest()
-
-    def clear(self) -> None:
-        """Release all."""
-        while self._actors:
-            self.release_oldest()

@@ -13,7 +13,7 @@ from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.conversation import Ask, Conversation, DeclarePresence, RunOverError, Steps, Wait, Work
 from daedalus.gateway.client_actor import ClientActor
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.learner_link import LearnerLink
 from daedalus.protocol.messages import Welcome
 from daedalus.transport.interface import Declaration, Transport, TransportError

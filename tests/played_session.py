@@ -9,7 +9,7 @@ from plain import vector_spaces
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.conversation import Ask, Query, Reopen, Wait, Work
 from daedalus.actor.session.session_engine import ActorSession, Begin, Collect, Encode, Load, Prepare
-from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
+from daedalus.learner.serving.snapshot_publisher import CompactSnapshotCache
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode

@@ -1,18 +1,67 @@
 """Rollouts, written row by row: actions from a policy, outcomes from the caller. No network, no threads."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.actor.collecting.episode_counter import EpisodeCounter
-from daedalus.actor.environments.interface import Observed
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.actor.environments.vector_environments import Observed
 from daedalus.policy.acting.noise import Noise, draw_noise
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinishedEpisodes:
+    """K episodes, in the order in which they ended."""
+
+    returns: np.ndarray  # [K] float64, undiscounted and unscaled
+    lengths: np.ndarray  # [K] int32, env_steps
+
+
+class EpisodeCounter:
+    """The running returns and lengths of E environments' episodes, and those of the episodes that ended."""
+
+    def __init__(self, count: int) -> None:
+        self._returns = np.zeros(count, np.float64)
+        self._lengths = np.zeros(count, np.int32)
+        self.ended = np.zeros(count, np.bool_)  # [E] whether the next step is the reset after an episode's end
+        self._finished: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def step(self, rewards: np.ndarray, valid: np.ndarray, ended: np.ndarray) -> None:
+        """Count one row: unscaled rewards, whether it is no reset row, and whether the episode ends; all [E]."""
+        self._returns += rewards
+        self._lengths += valid
+        self.ended = ended
+        if np.count_nonzero(self.ended):
+            self._finished.append((self._returns[self.ended], self._lengths[self.ended]))
+            self._returns[self.ended] = 0.0
+            self._lengths[self.ended] = 0
+
+    def cut(self) -> None:
+        """Note that all episodes ended with the row that was counted last."""
+        self._finished.append((self._returns.copy(), self._lengths.copy()))
+        self.restart()
+        self.ended[:] = True
+
+    def restart(self) -> None:
+        """Forget the running episodes: others begin."""
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        self.ended[:] = False
+
+    def take_finished(self) -> FinishedEpisodes:
+        """Return the episodes that ended since the last call."""
+        finished, self._finished = self._finished, []
+        returns, lengths = zip(*finished, strict=True) if finished else ((), ())
+        return FinishedEpisodes(
+            returns=np.concatenate([np.zeros(0), *returns]),
+            lengths=np.concatenate([np.zeros(0, np.int32), *lengths]),
+        )
 
 
 class RowInputs(NamedTuple):
@@ -135,7 +184,8 @@ class RolloutWriter:
 
     def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
         """Write what VectorEnvironment.step returned for those actions; return whether the rollout is full."""
-        row, valid = self._row, self._episodes.valid
+        row, resets = self._row, self._episodes.ended
+        valid = ~resets
         for name, frames in self._frames.items():
             frames[self._depths[name] + row] = observed.frames[name]
         self._rewards[row] = rewards
@@ -143,12 +193,13 @@ class RolloutWriter:
         self._truncated[row] = truncated
         self._valid[row] = valid
         # The row after a reset row is the first of its episode: its frame stack and memory begin anew.
-        self._stacks.push(observed.frames, ~valid)
+        self._stacks.push(observed.frames, resets)
         self._current_masks = observed.masks
-        # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
-        goes_on = valid & np.isfinite(self._next_state).all(axis=1)
-        self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
-        self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
+        if self._state.size:
+            # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
+            goes_on = valid & np.isfinite(self._next_state).all(axis=1)
+            self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
+        self._episodes.step(self._rewards[row], valid, self._terminated[row] | self._truncated[row])
         self._row += 1
         return self._row == len(self._rewards)
 

@@ -1,8 +1,8 @@
 """Creates environments from their specification."""
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import BackendEnvironments, VectorEnvironment
 from daedalus.actor.environments.transforms import TransformedEnvironment
+from daedalus.actor.environments.vector_environments import BackendEnvironments, VectorEnvironment
 from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
@@ -67,7 +67,7 @@ def make_bare(
 
             return make_envpool(spec, count)
         case "ale":
-            from daedalus.actor.environments.ale_backend import make_ale
+            from daedalus.actor.environments.atari import make_ale
 
             return make_ale(spec, count)
         case "gymnasium" | "fast":

@@ -12,8 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
 from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.actor.session.conversation import Conversation, Query, RunOverError, Steps, Wait, Work

@@ -24,8 +24,7 @@ import numpy as np
 from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import machine, table
 from benchmarks.study.tasks import TASKS, VARIANTS, specification
-from daedalus.cli.comparing.comparison import estimate, improvement
-from daedalus.cli.comparing.tables import written
+from daedalus.analysis.comparison import estimate, improvement, written
 
 _IDENTITY = ("task", "variant", "lag", "seed", "budget")
 _RESULTS = ("env_steps", "final_return", "env_steps_to_threshold", "lag_mean", "seconds")
@@ -45,7 +44,7 @@ class Cell:
 def run(cell: Cell) -> dict[str, Any]:
     """Make a run; return its line of the file."""
     from benchmarks.study.exact_lag import train
-    from daedalus.learner.training.allocator import keep_freed_memory
+    from daedalus.learner.run.process_resources import keep_freed_memory
 
     keep_freed_memory()
     began = time.monotonic()

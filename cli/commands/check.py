@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from daedalus.actor.checking.report import EnvironmentReport, advice, never_ends
+from daedalus.actor.checking.check_report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
 from daedalus.cli.logs import print_error, say
@@ -162,12 +162,12 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     """Return a description of the network, and an empty string; or an empty string, and why it cannot be learned."""
     if spaces is None:
         return "", ""
-    from daedalus.algorithms.errors import AlgorithmError
     from daedalus.algorithms.gradients import GradientComputer
     from daedalus.policy.acting.program import export_program
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
-    from daedalus.policy.network.errors import NetworkError
+    from daedalus.policy.user_modules import NetworkError
+    from daedalus.protocol.algorithms import AlgorithmError
 
     try:
         network = ActorCritic(spec.policy, spaces, modules, spec.training)

@@ -28,7 +28,7 @@ from daedalus.cli.processes import (
     raise_descriptor_limit,
     stop_on_signals,
 )
-from daedalus.gateway.tokens import OperatorToken
+from daedalus.gateway.security import OperatorToken
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys

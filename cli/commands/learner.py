@@ -4,8 +4,7 @@ Exit status: 0 the target was reached, all steps were done without a target to s
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed, or the last checkpoint could not be
 saved; 2 bad usage; 7 a newer learner of the run has taken over. Under `daedalus train` a learner that a signal stopped
 exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED. A supervised learner whose last
-checkpoint could not be saved exits with processes.UNSAVED. A learner of several processes that has lost one exits with
-processes.RANK_LOST, and is then started again.
+checkpoint could not be saved exits with processes.UNSAVED.
 """
 
 import argparse
@@ -19,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.algorithms.errors import AlgorithmError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.evaluation_processes import EvaluationFailedError
@@ -41,12 +39,9 @@ from daedalus.cli.processes import (
     stop_on_signals,
 )
 from daedalus.cli.quick_check import expected_defaults, expected_spaces
-from daedalus.cli.ranks import RankProcesses, StartedRanks, follow_launched, meeting_for, ranks_for
 from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
-from daedalus.cli.supervised_learner import supervise_learner
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
-from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
 from daedalus.learner.reporting.recorder import OpenWriter
@@ -54,20 +49,17 @@ from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.descriptors import reserve_descriptors
-from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
-from daedalus.learner.run.initial import allows_other_spaces, initial_to_resume
+from daedalus.learner.run.process_resources import keep_freed_memory, reserve_descriptors
+from daedalus.learner.run.resuming import CheckpointMismatchError, allows_other_spaces, finished_run, initial_to_resume
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
-from daedalus.learner.training.allocator import keep_freed_memory
-from daedalus.learner.training.errors import CheckpointMismatchError
-from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_words, modules_of
+from daedalus.policy.user_modules import ModuleNotAllowedError, NetworkError, UserModuleError, allow_words, modules_of
+from daedalus.protocol.algorithms import AlgorithmError
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.credentials import (
@@ -95,7 +87,6 @@ _FAILURES = (
     DamagedError,
     NetworkError,
     NoPolicyError,
-    RanksDisagreeError,
     SettingsError,
     TransportError,
 )
@@ -105,8 +96,7 @@ def main() -> int:
     """Run `daedalus learner` and return its exit status."""
     started = time.monotonic()
     arguments = learner_parser().parse_args()
-    surroundings = Surroundings()  # a network or an algorithm of the user may change them
-    here = surroundings.directory
+    here = Surroundings().directory  # a network or an algorithm of the user may change it
     keep_freed_memory()
     raise_descriptor_limit()
     reserve_descriptors()
@@ -116,20 +106,11 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop, user_metrics.add_line)
     try:
-        meeting = meeting_for(arguments)
-        if meeting is not None and meeting.rank > 0:
-            return follow_launched(meeting, arguments, stop)
         credentials = learner_credentials(arguments)
         run = choose_run(arguments)
         run = replace(run, directory=here / run.directory)
-        ranks = ranks_for(arguments, run, meeting)
-        if arguments.init_from is not None:  # in the options of all ranks it is as it was typed
+        if arguments.init_from is not None:
             arguments.init_from = here / arguments.init_from
-        if isinstance(ranks, StartedRanks) and not arguments.exit_with_parent:
-            if arguments.run_dir is None:
-                run, _ = _with_spaces(run, arguments, stop)
-            surroundings.restore()
-            return supervise_learner(run.directory, arguments, stop)
     except ModuleNotAllowedError as error:
         print_error("learner", allowing(error, ["daedalus", "learner", *sys.argv[1:]]))
         return BAD_USAGE
@@ -152,14 +133,9 @@ def main() -> int:
             started=arguments.started or started,
             user_metrics=user_metrics,
             context=context,
-            ranks=ranks,
         )
         with ExitStack() as stack:
             return command.serve(run, stack)
-    except RankLostError as error:
-        text, status = ranks.fault(error)
-        print_error("learner", text)
-        return status
     except _FAILURES as error:
         print_error("learner", error)
         return FAILED
@@ -176,12 +152,11 @@ class _Command:
     started: float  # on the monotonic clock
     user_metrics: UserMetrics
     context: dict[str, str]  # receives the fields of the log
-    ranks: RankProcesses  # the other processes of the learner
 
     def serve(self, run: ChosenRun, stack: ExitStack) -> int:
         """Run the learner to its end and return the exit status; `stack` closes what is opened.
 
-        Raises _FAILURES or RankLostError.
+        Raises _FAILURES.
         """
         arguments = self.arguments
         if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
@@ -192,12 +167,10 @@ class _Command:
         resumed = arguments.resume and run.exists
         if resumed and (reason := run_directory.why_superseded(run.directory)):
             print_error("learner", reason)
-            self.ranks.dismiss(run.spec, self.stop)
             return SUPERSEDED
         finished = finished_run(run.directory, run.spec) if resumed else None
         if finished is not None:
             _logger.info("nothing to do: %s", finished.reason)
-            self.ranks.dismiss(run.spec, self.stop)
             return NOT_REACHED if finished.missed else REACHED
         if run.changed:
             _logger.info("settings of the run changed: %s", ", ".join(run.changed))
@@ -212,7 +185,6 @@ class _Command:
         stopped = STOPPED if arguments.prepared else 0
         if transport is None:  # stopped while no router answered
             return stopped
-        stack.enter_context(self.ranks)
         stack.callback(transport.close)
         run = run if run.exists else self._with_directory(run, stack)
         try:
@@ -270,7 +242,6 @@ class _Command:
             modules=run.modules,
             certificate_days_left=partial(certificate_days_left, self.credentials),
             user_metrics=self.user_metrics,
-            open_ranks=self.ranks.open,
             confirms=self.arguments.confirm or (self.arguments.prepared is None and _confirms(run.spec)),
             reset_statistics=self.arguments.reset_statistics,
         )

@@ -10,7 +10,6 @@ from pathlib import Path
 from daedalus.cli.arguments import (
     add_allow_module,
     add_insecure,
-    add_processes,
     add_reset_statistics,
     add_tls,
     allowing,
@@ -38,7 +37,6 @@ from daedalus.cli.settings_arguments import (
     add_log,
     add_new_run,
     add_settings,
-    check_processes,
     named_directory,
     resolve_spec,
 )
@@ -46,9 +44,7 @@ from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.training_display import TrainingDisplay
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.changes import with_changes
-from daedalus.learner.run.finished import FinishedRun, finished_run
-from daedalus.learner.run.initial import check_initial, initial_to_resume
+from daedalus.learner.run.resuming import FinishedRun, check_initial, finished_run, initial_to_resume, with_changes
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
@@ -116,9 +112,7 @@ def train(arguments: list[str]) -> int:
         if parsed.run_dir is not None:
             run_directory.check_free(parsed.run_dir)  # before the environment is made
         check_initial(parsed.init_from, other_spaces=parsed.allow_other_spaces)
-        spec, spaces = prepare(
-            partial(resolve_spec, parsed), env=parsed.env, processes=parsed.processes or 1, fork=True
-        )
+        spec, spaces = prepare(partial(resolve_spec, parsed), env=parsed.env, fork=True)
         directory = parsed.run_dir or named_directory(parsed.preset, spec)
         lock = run_directory.create_locked(
             directory,
@@ -148,7 +142,6 @@ def resume(arguments: list[str]) -> int:
         _check_listening(parsed)
         _check_watching(parsed)
         spec = _resumed_spec(parsed)
-        check_processes(parsed.processes or 1, spec)
         init_from = initial_to_resume(parsed.directory)
         lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
@@ -235,7 +228,6 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
         help="let every user of this machine take part at /actor and /play of that page (with --watch)",
     )
     options.add_argument("--no-camera", action="store_true", help="play no episodes for the page (with --watch)")
-    add_processes(options)
     add_tls(options)
     add_insecure(options)
     add_logging(options)
@@ -276,7 +268,6 @@ def _run(
         started=started,
         lock=lock.inheritable,
         spaces=spaces,
-        processes=parsed.processes or 1,
         init_from=init_from,
         resume=resume,
         reset_statistics=resume and parsed.reset_statistics,

@@ -27,8 +27,6 @@ def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
     arguments += allow_settings(run.spec.learner_modules)
     if run.spaces is not None:
         arguments += ["--spaces", run.spaces.model_dump_json()]
-    if run.processes > 1:
-        arguments += ["--processes", str(run.processes)]
     if run.init_from is not None:
         arguments += ["--init-from", str(run.init_from)]
     if run.spec.training.target_return is not None:

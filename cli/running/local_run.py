@@ -43,7 +43,6 @@ class LocalRun:
     reset_statistics: bool = False  # of the checkpoint to resume from
     trained: int | None = None  # exit status of a run that is already trained and that only lacks its evaluation
     spaces: Spaces | None = None  # of the environment, if it was checked
-    processes: int = 1  # of the learner
     init_from: Path | None = None  # another run, whose weights the learner begins with
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None

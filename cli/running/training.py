@@ -28,8 +28,8 @@ from daedalus.cli.supervisor import (
     supervised_gateway,
 )
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
-from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.run_directory import OPERATOR_TOKEN
+from daedalus.learner.serving.events import EventFile
 from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)

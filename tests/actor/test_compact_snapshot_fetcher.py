@@ -9,7 +9,7 @@ from daedalus.actor.session import snapshots
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.conversation import Conversation, Query, Work
 from daedalus.actor.session.snapshots import CompactSnapshotFetcher
-from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
+from daedalus.learner.serving.snapshot_publisher import CompactSnapshotCache
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import bfloat16, float32

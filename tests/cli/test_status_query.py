@@ -13,7 +13,7 @@ from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
 from daedalus.cli.run_source import LearnerSource
 from daedalus.cli.status_query import ask, ask_events
-from daedalus.learner.reporting import report
+from daedalus.learner.reporting import run_reporter
 from daedalus.learner.run import heartbeat
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health
@@ -61,7 +61,7 @@ def server(operator: MemoryTransport) -> Iterator[ActorServer]:
     health = Health(started=0.0, updated=0.0, actor_seen=0.0)
 
     def status() -> RunStatus:
-        return report.run_status("r", EPOCH, spec, counters, opened.fleet, {}, health, 0, 1.0)
+        return run_reporter.run_status("r", EPOCH, spec, counters, opened.fleet, {}, health, 0, 1.0)
 
     transport = MemoryTransport(operator._network)
     opened = ActorServer("r", spec, transport, counters, status, learner_epoch=EPOCH, start_version=0, spaces=SPACES)

@@ -18,13 +18,21 @@ from daedalus.transport.addresses import AddressError, check_listening
 
 def commands_in_blocks(text: str) -> list[list[str]]:
     """Return the words after `daedalus` of each command line in a page's blocks."""
-    lines = [re.sub(r"\s#\s.*", "", line) for block in code_blocks(text) for line in block.splitlines()]
+    blocks = [block.replace("\\\n", " ") for block in code_blocks(text)]
+    lines = [re.sub(r"\s#\s.*", "", line) for block in blocks for line in block.splitlines()]
+    lines += [line for block in code_blocks(text, "text") for line in examples_of(block)]
     return [
         shlex.split(command)
         for line in lines
-        for part in re.split(r"&&|\s>\s", line)
+        for part in re.split(r"&&|\|\||\s>\s", line)
         for command in re.findall(r"(?<![`\w./'-])daedalus (?=[a-z])(.*)", part)
     ]
+
+
+def examples_of(help_text: str) -> list[str]:
+    """Return the command lines in the examples of a command's help, without the remarks behind them."""
+    lines = [line.strip() for line in help_text.splitlines() if line.startswith("  daedalus ")]
+    return [re.sub(r"\s{2,}.*", "", line) for line in lines]
 
 
 def commands_in_sentences(text: str) -> list[list[str]]:

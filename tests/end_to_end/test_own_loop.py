@@ -1,4 +1,4 @@
-"""examples/own_loop.py and examples/several_agents.py against a real learner."""
+"""Loops that the caller owns, and actors where a system lacks what only POSIX has."""
 
 import json
 import sys
@@ -38,17 +38,6 @@ def test_a_learner_trains_from_a_loop_that_the_caller_owns(
     loop.expect("the run is over")
 
 
-def test_a_client_takes_part_in_a_synchronous_run(
-    start: Callable[..., Running], address: str, example: Callable[..., Running]
-) -> None:
-    words = ("learner", "cartpole", "--algorithm", "a2c", "--env-steps", 1000, "--actors", 1, "--run-dir", "run")
-    learner = start(*words, "--listen", address, "--set", "collection.rollout_length=32")
-    loop = example("--name", "robot")
-    assert learner.wait() == 3, learner.output  # the budget ended without the target
-    assert loop.wait() == 0, loop.output
-    loop.expect("the run is over")
-
-
 @pytest.mark.parametrize(("algorithm", "environments"), [("appo", 1), ("a2c", 3)])
 def test_the_agents_of_one_loop_are_one_actor(
     start: Callable[..., Running],
@@ -58,19 +47,8 @@ def test_the_agents_of_one_loop_are_one_actor(
     algorithm: str,
     environments: int,
 ) -> None:
-    words = (
-        "--algorithm",
-        algorithm,
-        "--set",
-        "collection.rollout_length=64",
-        "--env-steps",
-        6_000,
-        "--actors",
-        1,
-        "--run-dir",
-        "run",
-    )
-    learner = start("learner", "cartpole", *words, "--listen", address)
+    sizes = ("--set", "collection.rollout_length=64", "--env-steps", 6_000, "--actors", 1, "--run-dir", "run")
+    learner = start("learner", "cartpole", "--algorithm", algorithm, *sizes, "--listen", address)
     loop = example("--name", "robots", "--agents", "3", script=AGENTS)
     loop.expect(f"joined run 'run' as 'robots': {environments} x CartPole-v1")
     assert learner.wait() == 3, learner.output  # the budget ended without the target
@@ -79,3 +57,49 @@ def test_the_agents_of_one_loop_are_one_actor(
     assert summary["env_steps"] >= 6_000
     assert summary["episodes"] >= 6_000 // 500 - 3  # of at most 500 env_steps, and one of each agent has not ended
     assert summary["rollouts_rejected"].keys() <= {"stale"}
+
+
+TESTS = Path(__file__).parents[1]
+SMALL = (
+    "--actors",
+    1,
+    "--env-steps",
+    3000,
+    "--set",
+    "collection.rollout_length=32",
+    "--set",
+    "training.batch_rollouts=2",
+)
+
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def portable(tmp_path: Path) -> Iterator[Start]:
+    """Start a script or a function without what only POSIX has."""
+    running: list[Running] = []
+
+    def start(what: str, *arguments: object) -> Running:
+        line = [sys.executable, str(TESTS / "without_posix.py"), what, *map(str, arguments)]
+        running.append(Running(line, tmp_path))
+        return running[-1]
+
+    yield start
+    for one in running:
+        one.end()
+
+
+def test_an_actor_and_a_client_run_to_the_end(start: Start, address: str, portable: Start) -> None:
+    learner = start("learner", "cartpole", *SMALL, "--listen", address, "--run-dir", "run")
+    actor = portable("daedalus.cli.commands.actor:main", "--connect", address, "--name", "plain", "--envs", 2)
+    loop = portable(str(OWN_LOOP), address, "--name", "robot")
+    assert learner.wait() == 3, learner.output  # the budget ended without the target
+    for ended in (actor, loop):
+        assert ended.wait() == 0, ended.output
+        ended.expect("the run is over")
+
+
+def test_the_command_starts_the_actor_as_a_child(portable: Start) -> None:
+    command = portable("daedalus.cli.main:main", "actor")
+    assert command.wait() == 2, command.output
+    command.expect("the following arguments are required: --connect")

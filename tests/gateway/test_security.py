@@ -16,20 +16,19 @@ import urllib.request
 import weakref
 from asyncio.transports import BaseTransport
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from certificates import change_certificates, make_certificates
 from gateways import JsonClient, RunningGateway
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
 from websockets.exceptions import ConnectionClosed
 
-from daedalus.cli.commands.certs import certs
 from daedalus.gateway import app, places, server
-from daedalus.gateway.errors import ClientError
-from daedalus.gateway.rate_limit import RateLimit
-from daedalus.gateway.security import guard
-from daedalus.gateway.tokens import TOKENS, Tokens, digest
+from daedalus.gateway.client_messages import ClientError
+from daedalus.gateway.security import TOKENS, RateLimit, Tokens, digest, guard
 from daedalus.transport.memory import MemoryNetwork
 
 Connect = Callable[..., JsonClient]
@@ -38,11 +37,7 @@ Connect = Callable[..., JsonClient]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Certificates of a gateway, and tokens of two clients."""
-    made = tmp_path_factory.mktemp("certificates") / "certs"
-    assert certs(["init", str(made)]) == 0
-    assert certs(["issue", "gateway", "--directory", str(made)]) == 0
-    assert certs(["issue", "client", "phone", "arm", "--directory", str(made)]) == 0
-    return made
+    return make_certificates(tmp_path_factory.mktemp("certificates") / "certs", "gateway", "client phone arm")
 
 
 @pytest.fixture
@@ -99,22 +94,19 @@ def test_connection_without_tls_is_not_served(secured: RunningGateway) -> None:
 
 
 def test_revoked_and_expired_tokens_are_refused_without_a_restart(tmp_path: Path) -> None:
-    made = tmp_path / "certs"
-    assert certs(["init", str(made)]) == 0
-    assert certs(["issue", "client", "phone", "--directory", str(made)]) == 0
-    assert certs(["issue", "gateway", "--directory", str(made)]) == 0  # tokens of before are its own too
+    made = make_certificates(tmp_path / "certs", "client phone", "gateway")  # tokens of before are its own too
     tokens, given = Tokens(made / "gateway"), token(made, "phone")
     tokens.check("phone", given)
     record = made / "gateway" / TOKENS
     record.write_text(json.dumps({"phone": {"sha256": digest(given), "expires": 1.0}}))
     with pytest.raises(ClientError, match="the token has expired"):
         tokens.check("phone", given)
-    assert certs(["renew", "client", "phone", "--directory", str(made)]) == 0
+    change_certificates(made, "renew client phone")
     with pytest.raises(ClientError, match="not one of this name"):
         tokens.check("phone", given)
     renewed = token(made, "phone")
     tokens.check("phone", renewed)
-    assert certs(["revoke", "client", "phone", "--directory", str(made)]) == 0
+    change_certificates(made, "revoke client phone")
     with pytest.raises(ClientError, match="not one of this name"):
         tokens.check("phone", renewed)
     assert not (made / "client-phone").exists()
@@ -138,7 +130,7 @@ def test_token_files_are_readable_by_their_owner_only_and_keep_no_token(folder: 
 
 def test_list_shows_tokens(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
-    assert certs(["list", "--directory", str(folder)]) == 0
+    change_certificates(folder, "list")
     listed = capsys.readouterr().out
     assert "client-phone" in listed
     assert "gateway " in listed
@@ -228,16 +220,13 @@ def test_connection_without_a_tls_handshake_is_closed(
     network: MemoryNetwork, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "_REQUEST_SECONDS", 0.3)
-    running = RunningGateway(network, folder / "gateway", follows=False)
-    try:
+    with closing(RunningGateway(network, folder / "gateway", follows=False)) as running:
         address = ("127.0.0.1", running.port)
         with (
             socket.create_connection(address, LIMIT / 4) as silent,  # asyncio's own limit is 60 s
             contextlib.suppress(ConnectionResetError),
         ):
             assert silent.recv(1) == b""
-    finally:
-        running.close()
 
 
 def test_large_first_messages_that_do_not_end_are_limited_and_the_oldest_ends(
@@ -279,8 +268,7 @@ def test_of_silent_connections_the_oldest_give_way_and_clients_stay(
 ) -> None:
     monkeypatch.setattr(server, "_REQUEST_SECONDS", 1e6)
     monkeypatch.setattr(server, "most_connections", lambda: 12)
-    running = RunningGateway(network, folder / "gateway" if secure else None)
-    try:
+    with closing(RunningGateway(network, folder / "gateway" if secure else None)) as running:
         connect = functools.partial(secure_client, running, folder) if secure else lambda: JsonClient(running.port)
         known, given = connect(), token(folder, "phone") if secure else ""
         assert known.hello("phone.1", token=given)["type"] == "welcome"
@@ -291,8 +279,6 @@ def test_of_silent_connections_the_oldest_give_way_and_clients_stay(
         assert known.act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
         for client in (known, late, *waiting):
             client.close()
-    finally:
-        running.close()
 
 
 def test_address_with_the_most_silent_connections_gives_way_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -352,8 +338,7 @@ def test_one_token_does_not_shut_out_others(
     network: MemoryNetwork, folder: Path, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(app, "MAX_CLIENTS", 3)
-    running = RunningGateway(network, folder / "gateway")
-    try:
+    with closing(RunningGateway(network, folder / "gateway")) as running:
         phone, arm = token(folder, "phone"), token(folder, "arm")
         greedy = [secure_client(running, folder) for _ in range(3)]
         for number, client in enumerate(greedy):
@@ -367,8 +352,6 @@ def test_one_token_does_not_shut_out_others(
         assert greedy[0].act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
         for client in greedy:
             client.close()
-    finally:
-        running.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="only root can be another user")
@@ -513,16 +496,14 @@ def test_client_that_reads_neither_answers_nor_pings_is_disconnected(
         "connection_made",
         lambda channel, transport: made.append(channel) or connection_made(channel, transport),
     )
-    client = JsonClient(gateway.port, sock=deaf_socket(gateway.port), max_queue=1, close_timeout=1.0)  # nobody answers
-    try:
+    # Nobody answers.
+    with closing(JsonClient(gateway.port, sock=deaf_socket(gateway.port), max_queue=1, close_timeout=1.0)) as client:
         assert client.hello("deaf")["type"] == "welcome"
         for _ in range(1000):
             client.send("act", observation=[0.0, 0.0, 0.0, 0.0])
         until(lambda: gateway.call(lambda: made[0].transport.get_write_buffer_size()) > 0)
         gateway.call(made[0].keepalive_timeout)
         until(lambda: not gateway.call(lambda: gateway.gateway._seats))
-    finally:
-        client.close()
 
 
 def test_ended_connections_are_forgotten(

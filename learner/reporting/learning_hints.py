@@ -1,0 +1,118 @@
+"""Hints for the user where a run does not learn, or no episode ends. State; no I/O."""
+
+import math
+from collections.abc import Mapping
+
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol.texts import exact_number, short_number
+
+_BASELINE_EPISODES = 20  # after so many, the policy is still about as random as at the start,
+_BASELINE_PROGRESS = 0.05  # unless they took more than this share of the budget
+_JUDGED_PROGRESS, _WATCHED_PROGRESS = 0.2, 0.1  # shares of the budget: of the judgement, and of the rows that count
+_LEAST_ROWS = 5
+_BETTER = 0.25  # standard deviations of the first episodes by which a mean return is better
+_COLLAPSED = 0.1  # of the first entropy
+
+
+class LearningHint:
+    """Judge of a run after a fifth of its budget, by its metrics rows.
+
+    A run has nothing to learn from where all returns are equal. It does not learn where the entropy has collapsed or
+    the explained variance stayed below 0, unless the mean return is higher than that of the first episodes, or the
+    newest evaluation better than the first. Runs that were resumed after the first episodes are not judged.
+    """
+
+    def __init__(self, budget: int, *, normalizes_rewards: bool) -> None:
+        """`budget` is in env_steps; `normalizes_rewards` is the setting `training.normalize_rewards`."""
+        self._budget, self._normalizes_rewards = budget, normalizes_rewards
+        self._first_return: tuple[float, float] | None = None  # mean and standard deviation
+        self._first_entropy: float | None = None
+        self._explained: list[float] = []
+        self._evaluations: list[tuple[float, float]] = []  # as _first_return; the first and the newest
+        self._lowest, self._highest = math.inf, -math.inf  # returns in all rows
+        self._judged = False
+        self._due = ""
+
+    def add(self, row: Mapping[str, float]) -> None:
+        """Add a metrics row."""
+        progress = row["env_steps"] / self._budget
+        if self._judged:
+            return
+        has_returns = "episode_return_mean" in row  # not before the first episode, and after a target not confirmed
+        if has_returns:
+            self._lowest = min(self._lowest, row["episode_return_min"])
+            self._highest = max(self._highest, row["episode_return_max"])
+        if self._first_entropy is None:
+            self._first_entropy = row.get("entropy")
+        if self._first_return is None and has_returns and row["episodes"] >= _BASELINE_EPISODES:
+            if progress > _BASELINE_PROGRESS:
+                self._judged = True
+                return
+            self._first_return = row["episode_return_mean"], row["episode_return_std"]
+        if "evaluation_return_mean" in row:
+            newest = row["evaluation_return_mean"], row.get("evaluation_return_std", 0.0)
+            self._evaluations = [*(self._evaluations[:1] or [newest]), newest]
+        if progress >= _WATCHED_PROGRESS and "explained_variance" in row:
+            self._explained.append(row["explained_variance"])
+        if progress >= _JUDGED_PROGRESS and has_returns:
+            self._judged = True
+            self._due = self._judgement(row)
+
+    def take(self) -> str:
+        """Return the hint if it is due, once, else an empty string."""
+        due, self._due = self._due, ""
+        return due
+
+    def _judgement(self, row: Mapping[str, float]) -> str:
+        if self._first_return is None:
+            return ""
+        trained = self._first_return, (row["episode_return_mean"], 0.0)
+        for (before, deviation), *_, (now, _) in (trained, self._evaluations or trained):
+            if now > before + _BETTER * deviation:
+                return ""
+        if self._lowest == self._highest:
+            return (
+                "this run has nothing to learn from: every episode so far has the return "
+                f"{exact_number(self._lowest)}, so that "
+                "no action was better than another; check the reward, and whether random actions can reach the goal"
+            )
+        first, entropy = self._first_entropy or 0.0, row.get("entropy", 0.0)
+        returns = f"after a fifth of the budget the mean return is {short_number(row['episode_return_mean'])}"
+        returns += f", and was {short_number(self._first_return[0])} at the start"
+        if first > 0.0 and entropy < _COLLAPSED * first:
+            return (
+                f"this run does not learn: {returns}, and the entropy fell from {first:.3g} to {entropy:.3g}, so the "
+                "policy explores no more; try a larger training.entropy_bonus or a smaller training.learning_rate"
+            )
+        if len(self._explained) >= _LEAST_ROWS and max(self._explained) < 0.0:
+            normalize = "" if self._normalizes_rewards else "training.normalize_rewards=true or "
+            return (
+                f"this run does not learn: {returns}, and the explained variance of the value stays below 0; "
+                f"try {normalize}a smaller training.learning_rate"
+            )
+        return ""
+
+
+# env_steps in each environment without the end of an episode after which a hint is given; the least in a small budget.
+_LONG_EPISODE, _USUAL_EPISODE = 10_000, 2_000
+
+
+class EpisodeHint:
+    """Hint that no episode has ended after many steps, or after half of a small budget; given once."""
+
+    def __init__(self, budget: int) -> None:
+        """`budget` is in env_steps."""
+        self._budget, self._given = budget, False
+
+    def take(self, counters: RunCounters, fleet: Fleet) -> str:
+        """Return the hint if it is due, else an empty string."""
+        environments = max(sum(fleet.actors[name].environments for name in fleet.live), 1)
+        length = min(_LONG_EPISODE, max(_USUAL_EPISODE, self._budget // (2 * environments)))
+        if self._given or counters.episodes or counters.env_steps < environments * length:
+            return ""
+        self._given = True
+        return (
+            f"no episode has ended after {length:,} env_steps in each environment: "
+            "if the environment never ends them, set environment.max_episode_steps"
+        )
