@@ -12,7 +12,7 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.running_returns import RunningReturns
-from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.protocol.keys import first_of_largest_owner, owner
 from daedalus.protocol.uploads import Rollout
 

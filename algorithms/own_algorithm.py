@@ -8,12 +8,11 @@ import torch
 from daedalus.algorithms import action_values, policy_gradient
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.algorithms.errors import AlgorithmError
 from daedalus.policy.network.action_distribution import ActionDistribution
 from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
-from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, is_own
+from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmError, AlgorithmRecord, is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 
 from daedalus.cli.run_source import LearnerSource
 from daedalus.gateway.app import application
+from daedalus.gateway.client_gateway import Gateway, GatewayConfig
 from daedalus.gateway.client_messages import ClientError
-from daedalus.gateway.gateway import Gateway, GatewayConfig
 from daedalus.gateway.security import LOOPBACK, OperatorToken, Tokens, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.watching.camera import CameraProcess

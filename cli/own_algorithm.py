@@ -12,8 +12,8 @@ def with_record(spec: RunSpec, modules: UserModules) -> RunSpec:
     """
     if not spec.training.user_modules:
         return spec
-    from daedalus.algorithms.errors import AlgorithmError
     from daedalus.algorithms.own_algorithm import own_class  # torch, which other runs do not need here
+    from daedalus.protocol.algorithms import AlgorithmError
 
     settings = spec.model_dump()
     try:

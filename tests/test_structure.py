@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "gateway", "cli")
+PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "gateway", "analysis", "cli")
 ALLOWED = {
     "protocol": {"protocol"},
     "transport": {"protocol", "transport"},
@@ -18,6 +18,7 @@ ALLOWED = {
     "actor": {"protocol", "transport", "policy", "algorithms", "actor"},
     "learner": {"protocol", "transport", "policy", "algorithms", "learner"},
     "gateway": {"protocol", "transport", "policy", "actor", "gateway"},
+    "analysis": set(PACKAGES),
     "cli": set(PACKAGES),
 }
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
@@ -124,7 +125,7 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("cli.commands.exporter", {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"}),
         ("protocol.codec", {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),
         ("gateway.server", {"torch", "daedalus.learner", "daedalus.algorithms"}),
-        ("gateway.gateway", {"torch", "daedalus.learner", "daedalus.algorithms"}),
+        ("gateway.client_gateway", {"torch", "daedalus.learner", "daedalus.algorithms"}),
     ],
 )
 def test_a_process_loads_only_what_it_needs(module: str, absent: set[str]) -> None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.actor.environments.interface import Observed
+from daedalus.actor.environments.vector_environments import Observed
 from daedalus.policy.acting.noise import Noise, draw_noise
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime

@@ -18,8 +18,8 @@ from daedalus.actor.environments.components import (
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.info import MASK_KEY, Masks, ObservedMasks, mask_of_one
-from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
 from daedalus.actor.environments.pixels import Pixels
+from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed, Step
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 

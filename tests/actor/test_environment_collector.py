@@ -18,7 +18,7 @@ from plain import PlainPolicy, plain, vector_spaces
 from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import Observed, Step
+from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import USER_STATE, UserModules
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec

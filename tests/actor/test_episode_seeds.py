@@ -11,8 +11,8 @@ from allowed_modules import TEST_MODULES
 from counting_environment import Counting
 from plain import PlainPolicy
 
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.actor.evaluation.episodes import Evaluation, play_episodes
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.program import export_program

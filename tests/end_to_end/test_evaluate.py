@@ -18,11 +18,10 @@ from processes import Running, processes_mentioning, until
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
+from daedalus.analysis.recorded_run import read_record
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate import main
-from daedalus.cli.comparing.recorded_run import read_run
 from daedalus.cli.evaluation_processes import EvaluationFailedError
-from daedalus.cli.reports.run_record import read_record
 from daedalus.cli.run_report import report as report_of
 from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.running.final_evaluation import evaluate_run
@@ -351,7 +350,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     assert evaluation["select_best"] == []
     episodes = read_json(run / "evaluation.json")
     assert len(episodes["returns"]) == len(episodes["lengths"]) == 3
-    recorded = read_record(read_run(_with_metrics(run))).evaluation
+    recorded = read_record(_with_metrics(run)).evaluation
     assert recorded is not None
     assert (recorded.returns, recorded.policy_version) == (tuple(episodes["returns"]), 4)
     assert result["evaluation_return_mean"] == evaluation["return_mean"]

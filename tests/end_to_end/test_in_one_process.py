@@ -3,9 +3,9 @@
 import io
 import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import safetensors.numpy
@@ -16,8 +16,10 @@ from daedalus.actor.session.service import ActorService
 from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.resuming import Beginning
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec
-from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.service import LearnerService, Outcome, Outputs
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
@@ -46,16 +48,11 @@ class RunningLearner:
     def __init__(self, network: MemoryNetwork, spec: RunSpec, directory: Path, *, resume: bool = False) -> None:
         self.stop, self.rows, self.outcomes = threading.Event(), Rows(), list[Outcome]()
         self._transport = MemoryTransport(network)
-        service = LearnerService(
-            spec,
-            directory,
-            self._transport,
-            self.stop,
-            Progress(io.StringIO(), spec.training.env_steps),
-            [lambda: self.rows],
-            started=0.0,
-            restored=load_newest(directory) if resume else None,
-        )
+        restored = load_newest(directory) if resume else None
+        context = RunContext.begin(directory, spec, self.stop, restored=restored)
+        progress = Progress(io.StringIO(), spec.training.env_steps)
+        outputs = Outputs(progress=progress, writers=[lambda: self.rows])
+        service = LearnerService(context, self._transport, outputs, Beginning(restored=restored))
         self._thread = threading.Thread(target=lambda: self.outcomes.append(service.run()), daemon=True)
         self._thread.start()
 
@@ -65,26 +62,34 @@ class RunningLearner:
         return self.outcomes[0]
 
 
+@contextmanager
+def playing(network: MemoryNetwork, actors: int) -> Iterator[None]:
+    """Let actors play, each on a thread, until the block and they end."""
+    stop = threading.Event()
+    configs = [ActorConfig(name=f"actor-{index}", incarnation=index) for index in range(actors)]
+    services = [ActorService(config, MemoryTransport(network), stop) for config in configs]
+    threads = [threading.Thread(target=service.run, daemon=True) for service in services]
+    try:
+        for thread in threads:
+            thread.start()
+        yield
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(LIMIT)
+            assert not thread.is_alive()
+
+
 @pytest.mark.parametrize("algorithm", ["a2c", "a3c"])
 def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, algorithm: str) -> None:
     settings = read_preset("cartpole")
     choose_algorithm(settings, algorithm)
-    changes: list[Any] = [
-        "collection.upload=gradients",
-        "collection.envs_per_actor=16",
-        "training.env_steps=1000000000",
-    ]
+    changes = ("collection.upload=gradients", "collection.envs_per_actor=16", "training.env_steps=1000000000")
     override(settings, [*changes, "training.normalize_rewards=true", "service.log_seconds=0.05"])
     spec, directory, network = run_spec(settings), tmp_path / "run", MemoryNetwork()
     run_directory.create(directory, spec)
-    stop = threading.Event()
-    configs = [ActorConfig(name=f"a{index}", incarnation=index) for index in (0, 1)]
-    actors = [ActorService(config, MemoryTransport(network), stop) for config in configs]
-    threads = [threading.Thread(target=actor.run, daemon=True) for actor in actors]
-    try:
-        first = RunningLearner(network, spec, directory)
-        for thread in threads:
-            thread.start()
+    first = RunningLearner(network, spec, directory)
+    with playing(network, 2):
         until(lambda: any(row["env_steps"] > 500 for row in first.rows.rows))
         (answer,) = MemoryTransport(network).query(keys.status("run"), timeout=LIMIT)
         report = decode(answer, STATUS_LIMITS)
@@ -97,10 +102,6 @@ def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, alg
         training = spec.training.model_copy(update={"env_steps": budget})
         second = RunningLearner(network, spec.model_copy(update={"training": training}), directory, resume=True)
         assert second.join().finished
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join(LIMIT)
     assert second.rows.rows[0]["env_steps"] >= env_steps
     last = second.rows.rows[-1]
     assert last["env_steps"] >= budget
@@ -125,29 +126,10 @@ GRADIENTS = "collection.upload=gradients"
 
 def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
     """Train with learner and actors as threads of this process, over the memory transport."""
-    network, stop = MemoryNetwork(), threading.Event()
+    network = MemoryNetwork()
     run_directory.create(directory, spec)
-    service = LearnerService(
-        spec,
-        directory,
-        MemoryTransport(network),
-        stop,
-        Progress(io.StringIO(), spec.training.env_steps),
-        [],
-        started=0.0,
-    )
-    outcomes: list[Outcome] = []
-    threads = [threading.Thread(target=lambda: outcomes.append(service.run()), daemon=True)]
-    for index in range(spec.collection.actors):
-        config = ActorConfig(name=f"actor-{index}", incarnation=index)
-        actor = ActorService(config, MemoryTransport(network), stop)
-        threads.append(threading.Thread(target=actor.run, daemon=True))
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(LIMIT)
-        assert not thread.is_alive()
-    return outcomes[0]
+    with playing(network, spec.collection.actors):
+        return RunningLearner(network, spec, directory).join()
 
 
 def checkpoint_files(directory: Path) -> dict[str, bytes]:

@@ -22,7 +22,7 @@ from daedalus.algorithms.normalization import (
 )
 from daedalus.algorithms.running_returns import RunningReturns
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec

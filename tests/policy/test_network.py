@@ -17,8 +17,8 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.custom_encoder import ObservationSpaces
 from daedalus.policy.network.encoders import Encoder, FlatEncoder, build_encoder
 from daedalus.policy.network.layers import BytesConv2d, PReLU, orthogonal
-from daedalus.policy.network.memory import Gru
 from daedalus.policy.network.perceptron import Perceptron
+from daedalus.policy.network.recurrent_memory import Gru
 from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
