@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from daedalus.actor.environments.environment_errors import EnvironmentSetupError
     from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
     from daedalus.actor.evaluation.video import VideoError
+    from daedalus.analysis.recorded_run import read_metrics
     from daedalus.cli.callbacks import Callback, TrainingRun
-    from daedalus.cli.comparing.recorded_run import read_metrics
     from daedalus.cli.evaluate_function import EvaluationResult, evaluate
     from daedalus.cli.train_function import RunResult, TrainingError, train
     from daedalus.learner.run.run_files import RunDataError
@@ -58,7 +58,7 @@ _MODULES = {
     "HubError": "daedalus.policy.saving.hub",
     "NoPolicyError": "daedalus.policy.saving.saved_policy",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
-    "RunDataError": "daedalus.cli.comparing.recorded_run",
+    "RunDataError": "daedalus.analysis.recorded_run",
     "RunResult": "daedalus.cli.train_function",
     "SettingsError": "daedalus.learner.run.settings",
     "TrainingError": "daedalus.cli.train_function",
@@ -66,7 +66,7 @@ _MODULES = {
     "VideoError": "daedalus.actor.evaluation.video",
     "evaluate": "daedalus.cli.evaluate_function",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
-    "read_metrics": "daedalus.cli.comparing.recorded_run",
+    "read_metrics": "daedalus.analysis.recorded_run",
     "train": "daedalus.cli.train_function",
 }
 

@@ -1,6 +1,7 @@
 """`daedalus sweep`: train runs of several settings and seeds on this machine, and compare them."""
 
 import argparse
+import copy
 import re
 import shlex
 import signal
@@ -10,22 +11,19 @@ from pathlib import Path
 
 import tomli_w
 
+from daedalus.analysis.sweep_execution import Display, RunProcesses, Sweep, report
+from daedalus.analysis.sweep_plan import Axis, Choices, Planner, Point, read_axis
+from daedalus.analysis.sweep_search import INSTALL, GridSearch, SampledSearch, Search, import_optuna
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.logs import configure_logging, print_error, say
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
 from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
-from daedalus.cli.sweeping.axes import Axis, Choices, read_axis
-from daedalus.cli.sweeping.display import Display
-from daedalus.cli.sweeping.plan import Planner
-from daedalus.cli.sweeping.processes import RunProcesses
-from daedalus.cli.sweeping.report import report
-from daedalus.cli.sweeping.searches import INSTALL, GridSearch, SampledSearch, Search, import_optuna
-from daedalus.cli.sweeping.sweep import Sweep
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.regular_files import replace_text
+from daedalus.protocol.spec import RunSpec
 
 _DESCRIPTION = """\
 Trains runs of several settings, each with several seeds, one after another or side by side (--jobs). Ends with a table
@@ -93,9 +91,15 @@ def sweep(arguments: list[str]) -> int:
     try:
         axes = _axes(parsed)
         folder = parsed.folder or _default_folder(parsed, axes)
-        search = _search(parsed, axes, folder)
+        if parsed.sampler:
+            import_optuna()  # before the check, which takes seconds
+        planner, seeds = _planner(parsed, folder)
+        search: Search | None = None
+        if not parsed.sampler:  # before the folder is made: the settings may be invalid
+            search = GridSearch(planner, [axis for axis in axes if isinstance(axis, Choices)], seeds)
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
+            search = search or SampledSearch(planner, axes, seeds, trials=parsed.trials or 20, folder=folder)
             _record(folder, parsed)
             return _run(search, folder, axes, parsed, arguments)
     except ModuleNotFoundError as error:
@@ -147,23 +151,41 @@ def _default_folder(parsed: argparse.Namespace, axes: Sequence[Axis]) -> Path:
     return Path("sweeps") / "-".join(re.sub(r"[^\w.]+", "-", word).strip("-.") for word in words if word)
 
 
-def _search(parsed: argparse.Namespace, axes: Sequence[Axis], folder: Path) -> Search:
-    """Check the environment, and return the search.
+def _planner(parsed: argparse.Namespace, folder: Path) -> tuple[Planner, range]:
+    """Check the environment, and return the planner of the runs, and their seeds.
 
-    Raises SettingsError, EnvironmentProblemError, ModuleNotFoundError.
+    Raises SettingsError, EnvironmentProblemError.
     """
-    if parsed.sampler:
-        import_optuna()  # before the check, which takes seconds
     spec, defaults = resolve_spec(parsed), None
     if parsed.env is None:
         checked_spaces(spec, fork=True)
     else:
         _, defaults = checked_defaults(spec, fork=True)
+
+    def settings(point: Point, seed: int) -> tuple[RunSpec, list[str]]:
+        options = with_point(parsed, point, seed)
+        return resolve_spec(options, defaults), train_words(options)
+
     first = resolve_spec(parsed, defaults).training.seed
-    seeds, planner = range(first, first + parsed.seeds), Planner(parsed, folder, defaults)
-    if parsed.sampler:
-        return SampledSearch(planner, axes, seeds, trials=parsed.trials or 20, folder=folder)
-    return GridSearch(planner, [axis for axis in axes if isinstance(axis, Choices)], seeds)
+    return Planner(folder, settings), range(first, first + parsed.seeds)
+
+
+def with_point(parsed: argparse.Namespace, point: Point, seed: int) -> argparse.Namespace:
+    """Return the options with the settings of a point."""
+    options = copy.copy(parsed)
+    options.seed = seed
+    options.set = [*parsed.set, *(f"{key}={value}" for key, value in point.items())]
+    return options
+
+
+def train_words(options: argparse.Namespace) -> list[str]:
+    """Return the words of the command line that trains with these options, after `daedalus`."""
+    words = ["train", *([options.preset] if options.preset is not None else [])]
+    for name in ("env", "algorithm", "actors", "seed", "env_steps", "wrap"):
+        value = getattr(options, name)
+        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
+    words += [word for tracker in options.log for word in ("--log", tracker)]
+    return [*words, *(word for assignment in options.set for word in ("--set", assignment))]
 
 
 def _locked(folder: Path) -> RunLock:

@@ -97,6 +97,7 @@ class _Bounded(torch.autograd.Function):
 
 
 _SMALLEST = 1e-30  # of uniform noise: at 0 a legal choice would be less probable than one that is not
+_FEW_CHOICES = 16  # on a CPU, torch's softmax and sums of so many take half the time over the first axis
 _ABSENT = -1e30  # logit of a choice that a variable does not have, or that is not legal: its probability is exactly 0
 
 
@@ -128,8 +129,11 @@ class Categorical(Distribution):
 
     def log_prob_and_entropy(self, parameters: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """See Distribution."""
-        log_probs = self._log_probs(parameters)
-        return _chosen(log_probs, actions), _categorical_entropy(log_probs)
+        arranged, axis = self._by_variable(parameters), -1
+        if arranged.shape[-1] <= _FEW_CHOICES:
+            arranged, axis = arranged.movedim(-1, 0), 0
+        log_probs = arranged.log_softmax(axis)
+        return _chosen(log_probs, actions, axis), _categorical_entropy(log_probs, axis)
 
     def _log_probs(self, parameters: Tensor) -> Tensor:
         return self._by_variable(parameters).log_softmax(-1)  # [..., D, A]
@@ -148,12 +152,12 @@ def without_illegal(logits: Tensor, mask: Tensor) -> Tensor:
     return logits.masked_fill(~mask, _ABSENT)
 
 
-def _chosen(log_probs: Tensor, actions: Tensor) -> Tensor:
-    return log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(-1)
+def _chosen(log_probs: Tensor, actions: Tensor, axis: int = -1) -> Tensor:
+    return log_probs.gather(axis, actions.unsqueeze(axis)).squeeze(axis).sum(-1)
 
 
-def _categorical_entropy(log_probs: Tensor) -> Tensor:
-    return -(log_probs.exp() * log_probs).sum(-1).sum(-1)
+def _categorical_entropy(log_probs: Tensor, axis: int = -1) -> Tensor:
+    return -(log_probs.exp() * log_probs).sum(axis).sum(-1)
 
 
 def _padded(counts: tuple[int, ...]) -> tuple[Tensor, Tensor]:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from processes import until
 
+from daedalus.analysis.statistics import mean_interval
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate_arguments import parser
-from daedalus.cli.comparing.statistics import mean_interval
 from daedalus.cli.running import confirmation as module
 from daedalus.cli.running.confirmation import Confirmations, confirmation, confirmation_arguments
 from daedalus.learner.run.confirmation_file import ConfirmationFile
