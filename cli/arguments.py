@@ -7,9 +7,8 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from daedalus.launch.run_choice import MOST_PROCESSES
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_words
-
-MOST_PROCESSES = 256  # of a learner
 
 
 def command_parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:

@@ -10,11 +10,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from daedalus.cli.child_output import inherited
-from daedalus.cli.logs import configure_logging, print_error
-from daedalus.cli.processes import RANK_LOST
-from daedalus.cli.settings_arguments import ChosenRun, check_processes, resolve_spec
-from daedalus.cli.supervisor import start
+from daedalus.cli.settings_arguments import resolve_spec
+from daedalus.launch.child_output import inherited
+from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.process_lifecycle import RANK_LOST
+from daedalus.launch.run_choice import ChosenRun, check_processes
+from daedalus.launch.supervision import start
 from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.ranks.meeting import Meeting, meeting_of
 from daedalus.learner.ranks.opening import lead, no_other_ranks

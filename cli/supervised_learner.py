@@ -8,10 +8,10 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from daedalus.cli.child_output import inherited
-from daedalus.cli.logs import configure_logging, print_error
-from daedalus.cli.processes import SUPERSEDED, UNSAVED
-from daedalus.cli.supervisor import LEARNER_GRACE_SECONDS, FailedError, Supervised, start, stop
+from daedalus.launch.child_output import inherited
+from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.process_lifecycle import SUPERSEDED, UNSAVED
+from daedalus.launch.supervision import LEARNER_GRACE_SECONDS, FailedError, Supervised, start, stop
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 

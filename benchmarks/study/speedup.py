@@ -39,7 +39,7 @@ from benchmarks.study.simulated_actors import train_simulated
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.comparing.comparison import estimate
 from daedalus.cli.comparing.tables import written
-from daedalus.cli.settings_arguments import Choice
+from daedalus.launch.run_choice import Choice
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import override
 from daedalus.protocol.spec import EnvironmentSpec

@@ -19,8 +19,8 @@ from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.service import ActorService
 from daedalus.cli.commands import actor_arguments as options
-from daedalus.cli.logs import configure_logging, print_error
-from daedalus.cli.processes import (
+from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.process_lifecycle import (
     FAILED,
     exit_on_thread_exceptions,
     exit_status,

@@ -11,10 +11,9 @@ import numpy as np
 
 from daedalus.actor.checking.report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
-from daedalus.cli.logs import print_error, say
-from daedalus.cli.quick_check import with_preset
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
+from daedalus.launch.environment_check import CheckTimeoutError, EnvironmentCheck, check_in_process, with_preset
+from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of

@@ -9,7 +9,7 @@ from daedalus.cli.comparing.comparison import compare_groups
 from daedalus.cli.comparing.recorded_run import SECONDS
 from daedalus.cli.comparing.selection import select
 from daedalus.cli.comparing.tables import as_csv, as_text
-from daedalus.cli.logs import print_error, say
+from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\

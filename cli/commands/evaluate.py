@@ -18,8 +18,8 @@ from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.evaluation_progress import EvaluationProgress, EvaluationStoppedError
-from daedalus.cli.logs import configure_logging, print_error, say
-from daedalus.cli.processes import (
+from daedalus.launch.logs import configure_logging, print_error, say
+from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
     exit_with_parent,
@@ -97,7 +97,7 @@ def main(
 
 def _record(result: dict[str, Any], directory: Path) -> bool:
     """Keep a result in a run directory, as the final evaluation does, and return whether that was possible."""
-    from daedalus.cli.evaluation_processes import evaluation_summary
+    from daedalus.launch.final_evaluation import evaluation_summary
     from daedalus.learner.run import run_directory  # other evaluations need no learner's code
     from daedalus.learner.run.settings import SettingsError
 

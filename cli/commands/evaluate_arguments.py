@@ -9,7 +9,7 @@ from typing import get_args
 
 from daedalus.actor.evaluation.video import FORMATS
 from daedalus.cli.arguments import add_allow_module, command_parser
-from daedalus.cli.logs import add_logging
+from daedalus.launch.logs import add_logging
 from daedalus.protocol.spec import Backend
 
 DESCRIPTION = """\

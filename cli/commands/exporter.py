@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.logs import add_logging, configure_logging, print_error
-from daedalus.cli.processes import status_at_start, stop_on_signals
-from daedalus.cli.status_query import ask
+from daedalus.launch.logs import add_logging, configure_logging, print_error
+from daedalus.launch.process_lifecycle import status_at_start, stop_on_signals
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import RunStatus
 from daedalus.transport.connecting import connect_with_retry
@@ -18,6 +17,7 @@ from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credent
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall
+from daedalus.transport.status_query import ask
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -74,7 +74,7 @@ class StatusCollector:
 
     def collect(self) -> Iterator["Metric"]:
         """Query the learners and return their metrics."""
-        from daedalus.cli.prometheus_metrics import metrics
+        from daedalus.launch.prometheus_exporter import metrics
 
         statuses = []
         if self.transport is not None:
@@ -107,7 +107,7 @@ def exporter(arguments: list[str]) -> int:
     try:
         from prometheus_client import CollectorRegistry
 
-        from daedalus.cli.metrics_server import MetricsServer
+        from daedalus.launch.prometheus_exporter import MetricsServer
     except ModuleNotFoundError:
         print_error("exporter", 'prometheus-client is not installed: pip install "daedalus-rl[monitoring]"')
         return 1

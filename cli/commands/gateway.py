@@ -18,9 +18,10 @@ from pathlib import Path
 from daedalus.actor.errors import ActorError
 from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_tls, command_parser
 from daedalus.cli.gateway_packages import INSTALL
-from daedalus.cli.logs import add_logging, configure_logging, print_error, say
 from daedalus.cli.other_runs import OtherRuns
-from daedalus.cli.processes import (
+from daedalus.gateway.tokens import OperatorToken
+from daedalus.launch.logs import add_logging, configure_logging, print_error, say
+from daedalus.launch.process_lifecycle import (
     BAD_USAGE,
     exit_on_thread_exceptions,
     exit_status,
@@ -28,7 +29,6 @@ from daedalus.cli.processes import (
     raise_descriptor_limit,
     stop_on_signals,
 )
-from daedalus.gateway.tokens import OperatorToken
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys
@@ -216,7 +216,7 @@ def main() -> int:
 def _camera(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Return the command of the camera's process."""
     values = [] if arguments.checkpoints is None else ["--checkpoints", str(arguments.checkpoints)]
-    return (sys.executable, "-P", "-m", "daedalus.cli.commands.camera", *allow_words(arguments.allow_module), *values)
+    return (sys.executable, "-P", "-m", "daedalus.launch.camera_process", *allow_words(arguments.allow_module), *values)
 
 
 def _announce(token_file: Path | None) -> Callable[[str], None]:
@@ -232,7 +232,7 @@ async def _serve(
     arguments: argparse.Namespace, chosen: "_Chosen", listener: socket.socket, stop: threading.Event
 ) -> None:
     # Imported here, because its packages are an extra.
-    from daedalus.cli.gateway_service import GatewayService, GatewaySettings
+    from daedalus.gateway.service import GatewayService, GatewaySettings
 
     settings = GatewaySettings(
         connect=arguments.connect,

@@ -21,12 +21,16 @@ from typing import TYPE_CHECKING
 
 from daedalus.algorithms.errors import AlgorithmError
 from daedalus.cli.arguments import allowing
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.evaluation_processes import EvaluationFailedError
 from daedalus.cli.learner_network import announce, learner_credentials, open_transport
-from daedalus.cli.logs import configure_logging, print_error
-from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.processes import (
+from daedalus.cli.ranks import RankProcesses, StartedRanks, follow_launched, meeting_for, ranks_for
+from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
+from daedalus.cli.supervised_learner import supervise_learner
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.confirmation import Confirmations
+from daedalus.launch.environment_check import expected_defaults, expected_spaces
+from daedalus.launch.final_evaluation import EvaluationFailedError
+from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.process_lifecycle import (
     BAD_USAGE,
     FAILED,
     ORDERED,
@@ -40,12 +44,8 @@ from daedalus.cli.processes import (
     status_at_start,
     stop_on_signals,
 )
-from daedalus.cli.quick_check import expected_defaults, expected_spaces
-from daedalus.cli.ranks import RankProcesses, StartedRanks, follow_launched, meeting_for, ranks_for
-from daedalus.cli.running.confirmation import Confirmations
-from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
-from daedalus.cli.supervised_learner import supervise_learner
-from daedalus.cli.tracking.tracker_processes import TrackerProcesses
+from daedalus.launch.run_choice import with_record
+from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress

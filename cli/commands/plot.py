@@ -8,7 +8,7 @@ from daedalus.cli.commands.compare import parse_groups
 from daedalus.cli.comparing.drawing import COLUMNS, INSTALL, draw_curves, draw_profiles
 from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
 from daedalus.cli.comparing.selection import select
-from daedalus.cli.logs import print_error, say
+from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\

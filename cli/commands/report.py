@@ -10,9 +10,9 @@ from daedalus.cli.commands.compare import parse_groups
 from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
 from daedalus.cli.comparing.selection import select
-from daedalus.cli.logs import print_error, say
 from daedalus.cli.reports.page import comparison_page, run_page
 from daedalus.cli.reports.run_record import RunRecord, read_record
+from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.replacing import replace_text
 

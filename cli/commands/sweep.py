@@ -11,9 +11,6 @@ from pathlib import Path
 import tomli_w
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.logs import configure_logging, print_error, say
-from daedalus.cli.processes import stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
 from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
 from daedalus.cli.sweeping.axes import Axis, Choices, read_axis
 from daedalus.cli.sweeping.display import Display
@@ -22,6 +19,9 @@ from daedalus.cli.sweeping.processes import RunProcesses
 from daedalus.cli.sweeping.report import report
 from daedalus.cli.sweeping.searches import INSTALL, GridSearch, SampledSearch, Search, import_optuna
 from daedalus.cli.sweeping.sweep import Sweep
+from daedalus.launch.environment_check import EnvironmentProblemError, checked_defaults, checked_spaces
+from daedalus.launch.logs import configure_logging, print_error, say
+from daedalus.launch.process_lifecycle import stop_on_signals
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError

@@ -1,11 +1,15 @@
 """`daedalus train` and `daedalus resume`: train with a learner and actors on this machine, and evaluate the policy."""
 
 import argparse
+import importlib.util
+import shlex
 import signal
 import sys
+from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from daedalus.cli.arguments import (
     add_allow_module,
@@ -17,33 +21,36 @@ from daedalus.cli.arguments import (
     command_parser,
     whole_number,
 )
-from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
-from daedalus.cli.logs import add_logging, configure_logging, print_error, say
-from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.processes import exit_with_parent, process_started, status_at_start, stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
-from daedalus.cli.run_report import report, show
-from daedalus.cli.running.local_run import (
-    LocalRun,
-    RunFailedError,
-    RunStoppedError,
-    UnsavedError,
-    resume_command,
-)
-from daedalus.cli.running.new_run import prepare
-from daedalus.cli.running.run_locally import run_locally
-from daedalus.cli.running.run_observer import RunObserver
+from daedalus.cli.screen import Screen, TrainingDisplay
 from daedalus.cli.settings_arguments import (
     add_log,
     add_new_run,
     add_settings,
-    check_processes,
     named_directory,
     resolve_spec,
 )
-from daedalus.cli.watching.screen import Screen
-from daedalus.cli.watching.training_display import TrainingDisplay
+from daedalus.launch.child_output import ChildOutput, inherited
+from daedalus.launch.environment_check import EnvironmentProblemError, checked_spaces
+from daedalus.launch.local_run import (
+    LocalRun,
+    RunFailedError,
+    RunObserver,
+    RunStoppedError,
+    UnsavedError,
+    resume_command,
+)
+from daedalus.launch.local_training import run_locally
+from daedalus.launch.logs import add_logging, configure_logging, print_error, say
+from daedalus.launch.process_lifecycle import (
+    UNWRITABLE,
+    discard,
+    exit_with_parent,
+    process_started,
+    status_at_start,
+    stop_on_signals,
+)
+from daedalus.launch.run_choice import check_processes, prepare, with_record
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
@@ -60,7 +67,64 @@ from daedalus.policy.user_modules import (
 )
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import exact_number, short_number
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
+
+
+def report(run: LocalRun, summary: dict[str, Any]) -> str:
+    """Return the result of a run from its summary.json, with the evaluation."""
+    target = run.spec.training.target_return
+    skipped = f" ({summary['updates_skipped']:,} skipped)" if summary.get("updates_skipped") else ""
+    updates = f"{summary['updates']:,} updates{skipped}"
+    if summary["solved"]:
+        trained = (
+            f"solved: mean return {exact_number(target)} reached after {summary['seconds_to_target']:.1f} s; "
+            f"{summary['env_steps']:,} env_steps, {updates} in all"
+        )
+    else:
+        goal = "" if target is None else f" (the target {exact_number(target)} was not reached)"
+        trained = f"done: {summary['env_steps']:,} env_steps, {updates}{goal}"
+    evaluation = summary["evaluation"]
+    evaluated = (
+        f"evaluation: return {short_number(evaluation['return_mean'])} +- {short_number(evaluation['return_std'])} "
+        f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
+        f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
+        f"on {evaluation['environment']} (backend {evaluation['backend']})"
+    )
+    folder = f"run directory: {run.directory}"
+    if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
+        folder += f"; draw the curves with: daedalus plot {shlex.quote(str(run.directory))} --output curve.png"
+    return "\n".join([trained, *_confirmed(run, summary), evaluated, *evaluation["notes"], folder])
+
+
+def show(text: str, command: str) -> None:
+    """Print the result of a run. A full disk is no fault of the run: standard error has one line of `command` then."""
+    try:
+        say(text)
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        discard(sys.stdout)
+        with suppress(OSError):
+            message = f"cannot print the result, which is in the run directory: {error.strerror}"
+            say(f"{command}: {message}", sys.stderr)
+
+
+def _confirmed(run: LocalRun, summary: dict[str, Any]) -> list[str]:
+    """Return the line about the new episodes that confirm "solved", if there is one."""
+    confirmation = summary.get("confirmation")
+    if confirmation is None:
+        return []
+    line = (
+        f"confirmation: return {short_number(confirmation['return_mean'])} over {confirmation['episodes']} new sampled "
+        "episodes of the policy at that moment"
+    )
+    if confirmation["interval"] is not None:
+        line += ", 95 % interval {} to {}".format(*map(short_number, confirmation["interval"]))
+    if run.spec.environment.trains_true_task:
+        line += f"; training mean {short_number(summary['episode_return_mean'])}"
+    return [line]
+
 
 _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows their progress. When the training episodes reach the

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from daedalus.cli.supervisor import stop
 from daedalus.cli.sweeping.plan import PlannedRun, has_begun
+from daedalus.launch.supervision import stop
 from daedalus.learner.run.run_directory import remove_failed
 
 FINISHED = {0, 3}  # exit statuses of `daedalus train`: target reached or all steps done, budget used up

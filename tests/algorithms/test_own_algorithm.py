@@ -10,8 +10,8 @@ from building import POLICY, RECURRENT, SPACES, identity, make_rollout, make_rol
 
 from daedalus.algorithms.errors import AlgorithmError
 from daedalus.algorithms.rollout_gradients import RolloutGradients
-from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.settings_arguments import choose_run, learner_parser
+from daedalus.launch.run_choice import with_record
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from daedalus.cli.commands import actor_arguments, train
-from daedalus.cli.running import child_arguments
-from daedalus.cli.running.local_run import LocalRun
 from daedalus.cli.settings_arguments import choose_run, learner_parser, resolve
+from daedalus.launch import local_run
+from daedalus.launch.local_run import LocalRun
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_settings
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
@@ -76,7 +76,7 @@ def test_train_passes_the_modules_of_its_settings_on(tmp_path: Path) -> None:
     assert (spec.environment, spec.policy.encoder) == (SPEC.environment, SPEC.policy.encoder)
     run_directory.write_config(tmp_path, spec)
     assert run_directory.read_config(tmp_path).environment.wrap == "wrappers:step_costs"
-    options = child_arguments.actor_arguments(LocalRun(directory=tmp_path, spec=spec, started=0.0))
+    options = local_run.actor_arguments(LocalRun(directory=tmp_path, spec=spec, started=0.0))
     assert options[-4:] == ("--allow-module", "corridor", "--allow-module", "wrappers")
 
 

@@ -1,4 +1,4 @@
-"""cli/status_query.py against the server of a learner: fleets of any size."""
+"""transport/status_query.py against the server of a learner: fleets of any size."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,8 +11,7 @@ from statuses import actor_status, run_status
 
 from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
-from daedalus.cli.run_source import LearnerSource
-from daedalus.cli.status_query import ask, ask_events
+from daedalus.gateway.watching.learner_source import LearnerSource
 from daedalus.learner.reporting import report
 from daedalus.learner.run import heartbeat
 from daedalus.learner.run.counters import RunCounters
@@ -40,13 +39,14 @@ from daedalus.protocol.messages import (
 )
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+from daedalus.transport.status_query import ask, ask_events
 
 MANY = 905
 
 
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.cli.status_query._PAGES_SECONDS", 100.0)
+    monkeypatch.setattr("daedalus.transport.status_query._PAGES_SECONDS", 100.0)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from daedalus.cli.prometheus_metrics import metrics
+from daedalus.launch.prometheus_exporter import metrics
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
 DASHBOARD = json.loads((GRAFANA / "dashboards" / "daedalus.json").read_text())

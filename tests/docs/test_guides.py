@@ -12,8 +12,8 @@ from pages import DOCS, code_blocks
 from plain import PlainEnvironments, act, choices, plain_spaces
 
 from daedalus.actor.environments.make import make_environments
-from daedalus.cli.callbacks import TrainingRun
-from daedalus.cli.own_algorithm import with_record
+from daedalus.launch.callbacks import TrainingRun
+from daedalus.launch.run_choice import with_record
 from daedalus.learner.reporting.metrics import Details, MetricsWriter
 from daedalus.learner.run.settings import choose_algorithm, read_settings, run_spec
 from daedalus.learner.training.learner import Learner

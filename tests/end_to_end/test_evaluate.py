@@ -20,15 +20,14 @@ from processes import Running, processes_mentioning, until
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
-from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate import main
+from daedalus.cli.commands.train import report as report_of
 from daedalus.cli.comparing.recorded_run import read_run
-from daedalus.cli.evaluation_processes import EvaluationFailedError
 from daedalus.cli.reports.run_record import read_record
-from daedalus.cli.run_report import report as report_of
-from daedalus.cli.running.confirmation import Confirmations
-from daedalus.cli.running.final_evaluation import evaluate_run
-from daedalus.cli.running.local_run import LocalRun
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.confirmation import Confirmations
+from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
+from daedalus.launch.local_run import LocalRun
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_directory import create, read_json, write_config, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime

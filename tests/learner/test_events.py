@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from log_lines import LINES
 
-from daedalus.cli.logs import EVENTS
+from daedalus.launch.logs import EVENTS
 from daedalus.learner.serving import events
 from daedalus.learner.serving.events import EventLog
 

@@ -14,8 +14,8 @@ from ranked import SECONDS, Rank, connected, ranked_learner, spec_of
 from torch._C._distributed_c10d import HashStore
 
 from daedalus.cli import ranks
-from daedalus.cli.processes import RANK_LOST
 from daedalus.cli.ranks import LaunchedRanks, StartedRanks, follow
+from daedalus.launch.process_lifecycle import RANK_LOST
 from daedalus.learner.ranks import agreement
 from daedalus.learner.ranks.agreement import Options, this_run
 from daedalus.learner.ranks.commands import CommandKind, give, receive

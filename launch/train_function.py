@@ -13,14 +13,13 @@ from numbers import Integral
 from pathlib import Path
 from typing import Any, TextIO
 
-from daedalus.cli.callbacks import Callback, observed
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.logs import LineHandler, say
-from daedalus.cli.quick_check import EnvironmentProblemError
-from daedalus.cli.running.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError
-from daedalus.cli.running.new_run import prepare
-from daedalus.cli.running.run_locally import run_locally
-from daedalus.cli.settings_arguments import Choice, named_directory
+from daedalus.launch.callbacks import Callback, observed
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.environment_check import EnvironmentProblemError
+from daedalus.launch.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError
+from daedalus.launch.local_training import run_locally
+from daedalus.launch.logs import LineHandler, say
+from daedalus.launch.run_choice import Choice, named_directory, prepare
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.initial import check_initial

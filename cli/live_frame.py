@@ -4,17 +4,38 @@ Texts of peers, such as the names of actors, are in one line, without control ch
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from daedalus.cli.watching.sparkline import ASCII, BLOCKS, sparkline
-from daedalus.cli.watching.watched_run import WatchedRun
+from daedalus.cli.run_watcher import WatchedRun
 from daedalus.learner.reporting.progress import duration
 from daedalus.protocol.messages import ActorStatus
 from daedalus.protocol.texts import one_line, short_number
+
+BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
+
+
+def sparkline(values: Sequence[float], width: int, levels: str = BLOCKS) -> str:
+    """Return a curve of at most `width` characters.
+
+    Args:
+      values: finite numbers. If there are more than `width`, each character is the mean of neighbours.
+      width: in characters.
+      levels: characters from the lowest to the highest.
+    """
+    if not values or width < 1:
+        return ""
+    columns = min(width, len(values))
+    edges = [len(values) * index // columns for index in range(columns + 1)]
+    means = [sum(values[a:b]) / (b - a) for a, b in pairwise(edges)]
+    low, high = min(means), max(means)
+    scale = (len(levels) - 1) / (high - low) if high > low else 0.0
+    return "".join(levels[round((mean - low) * scale)] for mean in means)
+
 
 _WIDE = 60  # columns
 _SPARKLINE_WIDTH = 60  # at most

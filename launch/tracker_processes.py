@@ -4,19 +4,60 @@ A tracker runs in a process of its own, with a low priority: its package can nei
 or wait in a process of the run.
 """
 
+import argparse
 import logging
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.supervisor import start
-from daedalus.learner.reporting.trackers.tracker import is_installed
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.logs import configure_logging, say
+from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.launch.supervision import start
+from daedalus.learner.reporting.trackers.tracker import TRACKERS, is_installed, tracker_class
+from daedalus.learner.reporting.trackers.tracking import Tracking
+from daedalus.learner.run.run_directory import run_name
+
+_END_SECONDS = 60.0  # after the end of the run; a parent that lives ends this process before
+
+
+def main() -> int:
+    """Run the process and return its exit status."""
+    options = argparse.ArgumentParser()
+    options.add_argument("name", choices=TRACKERS)
+    options.add_argument("directory", type=Path)
+    options.add_argument("--service", action="store_true")
+    options.add_argument("--log-json", action="store_true")
+    options.add_argument("--exit-with-parent", action="store_true")
+    parsed = options.parse_args()
+    process, context = "tracker" if parsed.service else "", {"run": run_name(parsed.directory)}
+    configure_logging(as_json=parsed.log_json, process=process, context=context, write=_own_output())
+    finish = stop_on_signals()
+    exit_with_parent(finish)
+    threading.Thread(target=_end_in_time, args=(finish,), name="end", daemon=True).start()
+    done = Tracking(parsed.name, parsed.directory, tracker_class(parsed.name), finish).run()
+    os._exit(0 if done else 1)  # packages of trackers wait for the network at the end of the interpreter
+
+
+def _own_output() -> Callable[[str], None]:
+    """Return a function that prints a line on standard output. What packages print goes to standard error."""
+    own = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
+    sys.stdout.flush()
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return lambda line: say(line, own)
+
+
+def _end_in_time(finish: threading.Event) -> None:
+    finish.wait()
+    time.sleep(_END_SECONDS)
+    os._exit(1)
+
 
 _FINISH_SECONDS = 30.0  # to upload what is left at the end of the run
 _STOP_SECONDS = 2.5  # the same after Ctrl-C
@@ -65,7 +106,7 @@ class TrackerProcesses:
                 continue
             arguments = (name, str(self._directory), *self._logging)
             with self._output.pipes(name, shown=("stdout",)) as streams:
-                process = start("daedalus.cli.tracking.process", *arguments, streams=streams, own_session=True)
+                process = start("daedalus.launch.tracker_processes", *arguments, streams=streams, own_session=True)
             with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
                 os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + _NICENESS)
             self._processes[name] = process
@@ -107,3 +148,8 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
         os.killpg(process.pid, signal.SIGKILL)
     process.kill()
     process.wait()
+
+
+if __name__ == "__main__":
+    exit_on_thread_exceptions()
+    sys.exit(main())

@@ -1,23 +1,30 @@
-"""The learner and the actors of one run, as supervised child processes."""
+"""One run on this machine: training by supervised processes, then the evaluation of the result."""
 
 import logging
 import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import Any
 
-from daedalus.cli.child_output import ChildOutput, OpenStreams
-from daedalus.cli.processes import ORDERED, SUPERSEDED, UNSAVED
-from daedalus.cli.running.child_arguments import (
+from daedalus.launch.child_output import ChildOutput, OpenStreams, inherited
+from daedalus.launch.confirmation import Confirmations
+from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
+from daedalus.launch.local_run import (
+    LocalRun,
+    RunEnd,
+    RunFailedError,
+    RunStoppedError,
+    UnsavedError,
     actor_arguments,
     evaluation_arguments,
     gateway_arguments,
     learner_arguments,
+    resume_command,
 )
-from daedalus.cli.running.confirmation import Confirmations
-from daedalus.cli.running.local_run import LocalRun
-from daedalus.cli.supervisor import (
+from daedalus.launch.process_lifecycle import ORDERED, SUPERSEDED, UNSAVED, UNWRITABLE
+from daedalus.launch.supervision import (
     GATEWAY,
     LEARNER_GRACE_SECONDS,
     FailedError,
@@ -27,7 +34,8 @@ from daedalus.cli.supervisor import (
     supervised_actor,
     supervised_gateway,
 )
-from daedalus.cli.tracking.tracker_processes import TrackerProcesses
+from daedalus.launch.tracker_processes import TrackerProcesses
+from daedalus.learner.run import run_directory
 from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.run_directory import OPERATOR_TOKEN
 from daedalus.transport.private_address import private_address
@@ -166,3 +174,64 @@ def _warn(message: str | None, record: EventFile) -> None:
     if message:
         _logger.warning("%s", message)
         record.add_restart(message)
+
+
+def run_locally(
+    run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams = inherited
+) -> RunEnd:
+    """Train until the target or the end of the budget, then evaluate the best checkpoint.
+
+    No child process is left when this returns or raises.
+
+    Args:
+      run: what to run.
+      stopping: ends the run early when it is set.
+      output: reads what the actors and the evaluations write.
+      learner_streams: where the learner writes its log and its progress.
+
+    Raises RunFailedError or RunStoppedError.
+    """
+    page: list[Supervised] = []
+    trackers = TrackerProcesses(run.log, run.directory, output, log_json=run.log_json)
+    try:
+        if run.trained is None:
+            status = train(run, stopping, output, learner_streams, page, trackers)
+        else:
+            trackers.start()
+            status = run.trained
+        if stopping.is_set() or status == ORDERED:
+            raise RunStoppedError
+        if status == UNSAVED:
+            raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
+        if status not in FINISHED:
+            raise RunFailedError(status=status)
+        return RunEnd(status=status, summary=_evaluated(run, stopping, output))
+    except (FailedError, EvaluationFailedError) as error:
+        if stopping.is_set():
+            raise RunStoppedError from None
+        raise RunFailedError(str(error)) from None
+    except KeyboardInterrupt:  # in a function of the public API
+        stopping.set()
+        raise
+    finally:
+        stop([gateway.process for gateway in page])  # until now it has shown the result
+        trackers.finish(stopping)
+        if run.watch:
+            with suppress(OSError):
+                (run.directory / run_directory.OPERATOR_TOKEN).unlink()
+
+
+def _remedy(run: LocalRun) -> str:
+    return f"make room on the disk, or make it writable, then type: {resume_command(run)}"
+
+
+def _evaluated(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
+    """Return the summary with the evaluation. Raises UnsavedError on a full disk, and EvaluationFailedError."""
+    if not (run.directory / run_directory.SUMMARY).exists():  # the learner has said why
+        raise UnsavedError(f"the summary of the run could not be saved: {_remedy(run)}")
+    try:
+        return evaluate_run(run, stopping, output)
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        raise UnsavedError(f"the evaluation could not be saved: {error.strerror}: {_remedy(run)}") from None

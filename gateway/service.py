@@ -13,7 +13,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
-from daedalus.cli.run_source import LearnerSource
 from daedalus.gateway.app import application
 from daedalus.gateway.config import GatewayConfig
 from daedalus.gateway.errors import ClientError
@@ -22,6 +21,7 @@ from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import OperatorToken, Tokens
 from daedalus.gateway.watching.camera import CameraProcess
+from daedalus.gateway.watching.learner_source import LearnerSource
 from daedalus.gateway.watching.monitor import RunMonitor
 from daedalus.gateway.watching.observation import Observation
 from daedalus.gateway.watching.page_data import PageData

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from daedalus.cli.status_query import ask, ask_events, decoded, newest_of_each_run
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, METRICS_LIMITS
@@ -17,6 +16,7 @@ from daedalus.protocol.messages import (
     RunStatus,
 )
 from daedalus.transport.interface import Transport
+from daedalus.transport.status_query import ask, ask_events, decoded, newest_of_each_run
 
 _ANSWER_SECONDS = 5.0
 

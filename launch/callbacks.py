@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from daedalus.cli.running.run_observer import RunObserver
+from daedalus.launch.local_run import RunObserver
 from daedalus.learner.reporting.user_metrics import MOST_METRICS
 from daedalus.policy.user_code import Surroundings
 from daedalus.protocol.keys import is_name

@@ -9,9 +9,9 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.comparing.statistics import mean_interval
-from daedalus.cli.evaluation_processes import EvaluationFailedError, EvaluationProcess, without_episodes
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.final_evaluation import EvaluationFailedError, EvaluationProcess, without_episodes
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.policy.saving.saved_policy import checkpoint_path
 from daedalus.protocol.spec import RunSpec

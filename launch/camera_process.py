@@ -13,15 +13,19 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
 from daedalus.cli.arguments import add_allow_module
-from daedalus.cli.checkpoint_values import CheckpointValues
-from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, stop_on_signals
 from daedalus.gateway.watching.camera import LENGTH, frame, note
+from daedalus.launch.logs import configure_logging
+from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, stop_on_signals
 from daedalus.learner.run.run_directory import run_name
-from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
+from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.codec import ProtocolError, decode
@@ -29,6 +33,39 @@ from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.messages import Message, Program, Snapshot, Welcome
 
 _logger = logging.getLogger("daedalus.cli")
+
+
+class CheckpointValues:
+    """Estimates of one run, as far as torch is installed and there is a checkpoint."""
+
+    def __init__(self, directory: Path, modules: UserModules) -> None:
+        self._directory, self._modules = directory, modules
+        self._loaded: Path | None = None
+        self._estimate = _unknown
+
+    def refresh(self) -> None:
+        """Use the newest checkpoint from now on. What cannot be read leaves the estimates as they are."""
+        newest = next(iter(checkpoints(self._directory)), None)
+        if newest is None or newest == self._loaded:
+            return
+        try:
+            from daedalus.policy.acting.value_estimator import ValueEstimator  # imports torch
+
+            self._estimate = ValueEstimator(read_policy(newest), self._modules)
+        except ImportError:
+            _logger.debug("there are no value estimates without torch")
+        except (DamagedError, PolicyError, OSError) as error:  # such as a checkpoint that was pruned meanwhile
+            _logger.debug("no value estimates: %s", error)
+        self._loaded = newest
+
+    def __call__(self, observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
+        """Return the value of one observation; None if it is not known. See ValueEstimator."""
+        return self._estimate(observations, state)
+
+
+def _unknown(observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
+    return None
+
 
 FRAMES_PER_SECOND = 15.0
 _LONGEST_SECONDS = 1.0  # for one frame, for somebody who waits

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from daedalus.cli.child_output import OpenStreams, Streams, inherited
-from daedalus.cli.processes import RANK_LOST, STOPPED, interrupts_held
+from daedalus.launch.child_output import OpenStreams, Streams, inherited
+from daedalus.launch.process_lifecycle import RANK_LOST, STOPPED, interrupts_held
 
 GATEWAY = "gateway"  # name of its process
 # Exit statuses that mean something for a learner only.
