@@ -1,4 +1,4 @@
-"""Learning of action values, shared by one_step_q, one_step_sarsa and n_step_q: Mnih et al. (2016), section 4."""
+"""Learning of action values: one_step_q, one_step_sarsa and n_step_q. Mnih et al. (2016), section 4."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,8 @@ from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.losses import shares_of
 from daedalus.algorithms.returns import lambda_returns
-from daedalus.policy.network.distributions.categorical import without_illegal
+from daedalus.policy.network.distributions import without_illegal
+from daedalus.protocol.algorithms import ALGORITHMS
 
 
 class ActionValues(Algorithm):
@@ -83,3 +84,47 @@ class ActionValues(Algorithm):
         """See Algorithm: copy the network to the target network every `training.target_period` updates."""
         if policy_version % self.spec.target_period == 0:
             forward.update_target()
+
+
+class OneStepQ(ActionValues):
+    """Mnih et al. (2016), algorithm 1: the target is r_t + d_t max_a Q-(s_{t+1}, a).
+
+    In the paper a thread accumulates the gradients of several steps for each update. Here they are the rows of a
+    rollout, whose mean gradient makes one update. Each row has a one-step target.
+    """
+
+    record = ALGORITHMS["one_step_q"]
+
+
+class OneStepSarsa(ActionValues):
+    """Mnih et al. (2016), section 4.2: the target is r_t + d_t Q-(s_{t+1}, a_{t+1}).
+
+    a_{t+1} is the action of the behaviour policy, whose exploration the values therefore include. The next action of
+    the last row of a rollout is in the next rollout: such a row is not learned from, unless its episode terminated.
+    """
+
+    record = ALGORITHMS["one_step_sarsa"]
+
+    def next_values(self, values: Tensor, batch: Batch) -> Tensor:
+        """See ActionValues. At the end of an episode, a_{t+1} was chosen from the final observation, and not taken."""
+        (actions,) = batch.actions.values()
+        return values.gather(-1, actions[1:]).squeeze(-1)
+
+
+class NStepQ(ActionValues):
+    """Mnih et al. (2016), algorithm S2: the target of row t is the return to the end of the rollout.
+
+    The paper's rollout ends with an episode; here it goes on with the next one.
+
+        G_t = r_t + d_t (max_a Q-(s_{t+1}, a) if truncated_t or t = T-1 else G_{t+1})
+
+    The actions in between are those of the behaviour policy, and are not corrected for. With `training.trace_lambda`
+    below 1, the returns are mixed over all horizons: Peng & Williams (1996), Q(lambda).
+    """
+
+    record = ALGORITHMS["n_step_q"]
+
+    @property
+    def trace_lambda(self) -> float:
+        """See ActionValues."""
+        return self.spec.trace_lambda

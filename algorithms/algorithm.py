@@ -13,7 +13,7 @@ from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.forward import Forward
 from daedalus.algorithms.minibatches import Minibatch
-from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.network.action_distribution import ActionDistribution
 from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.spec import LossSpec
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.ranks import ONE_RANK, RankPart, Ranks
-from daedalus.policy.network.components import Components, map_components
+from daedalus.policy.network.layers import Components, map_components
 from daedalus.protocol.frames import stack_rows
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.uploads import Rollout

@@ -1,11 +1,48 @@
 """Diagnostics of a batch before its first update: how far the behaviour policy is, and how wrong the critic. Pure."""
 
+import itertools
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import explained_variance, mean, shares_of, variance
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
+
+
+class ActionCounts:
+    """Counts over batches, on a device."""
+
+    def __init__(self, spaces: Spaces, device: torch.device) -> None:
+        discrete = {name: space for name, space in spaces.actions.items() if isinstance(space, DiscreteSpace)}
+        self._counts = {
+            name: torch.zeros(space.choices, dtype=torch.int64, device=device) for name, space in discrete.items()
+        }
+        self._first_choices = {  # of each variable among all choices of its component
+            name: torch.tensor([0, *itertools.accumulate(space.counts[:-1])], device=device)
+            for name, space in discrete.items()
+        }
+
+    def add(self, batch: Batch) -> None:
+        """Count the actions of the valid rows of a batch."""
+        for name, counts in self._counts.items():
+            choices = batch.actions[name].to(counts.device) + self._first_choices[name]  # [T, B, D]
+            weights = batch.valid.to(counts.device).unsqueeze(-1).expand(choices.shape)
+            counts += torch.bincount(choices.flatten(), weights.flatten(), len(counts)).to(torch.int64)
+
+    def merge(self, counts: dict[str, torch.Tensor]) -> None:
+        """Add counts by component, [choices] int64."""
+        for name, own in self._counts.items():
+            own += counts[name].to(own.device)
+
+    def take(self) -> dict[str, list[int]]:
+        """Return the counts by component since the last call."""
+        taken = {name: counts.tolist() for name, counts in self._counts.items()}
+        for counts in self._counts.values():
+            counts.zero_()
+        return taken
+
 
 BATCH_METRICS = ("explained_variance", "value_mean", "advantage_std")
 VALUE_ERROR_QUANTILES = {"value_error_p05": 0.05, "value_error_p50": 0.5, "value_error_p95": 0.95}

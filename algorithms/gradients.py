@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,19 +11,35 @@ from torch import Tensor
 from daedalus.algorithms.algorithm import Losses, MinibatchLosses
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
-from daedalus.algorithms.flat_parameters import FlatParameters
-from daedalus.algorithms.forward import Forward
+from daedalus.algorithms.forward import FlatParameters, Forward
 from daedalus.algorithms.losses import mean, value_loss
-from daedalus.algorithms.own_algorithm import check_updates
-from daedalus.algorithms.precision import is_mixed
+from daedalus.algorithms.own_algorithm import build_algorithm, check_updates
 from daedalus.algorithms.ranks import RankPart
 from daedalus.algorithms.recording import OperationRecorder
-from daedalus.algorithms.registry import build_algorithm
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.algorithms import is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec
+
+
+def is_mixed(precision: Literal["auto", "float32", "bfloat16"], device: torch.device, convolutional: bool) -> bool:
+    """Return whether forward passes compute in bfloat16: if it is requested or known to be faster.
+
+    "auto" means bfloat16 for a convolutional network on a device that multiplies bfloat16 in hardware.
+    """
+    return precision == "bfloat16" or (precision == "auto" and convolutional and _multiplies_bfloat16(device))
+
+
+def _multiplies_bfloat16(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    try:
+        flags = Path("/proc/cpuinfo").read_text("utf-8")
+    except OSError:
+        return False
+    return "avx512_bf16" in flags or "amx_bf16" in flags
+
 
 _MOST_ROWS = 32  # of a recorded sequence: a memory takes long to record, 5 ms for each row, and gains little
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import shares_of
-from daedalus.policy.network.components import Components, map_components
+from daedalus.policy.network.layers import Components, map_components
 
 _LARGE_BYTES = 4096  # of one row of a component, from which on it is not copied for a whole pass
 

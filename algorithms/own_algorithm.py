@@ -5,14 +5,16 @@ from typing import Any
 
 import torch
 
+from daedalus.algorithms.action_values import NStepQ, OneStepQ, OneStepSarsa
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.errors import AlgorithmError
-from daedalus.policy.network.components import map_components
-from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.algorithms.policy_gradient import A2c, A3c, Appo, Impala
+from daedalus.policy.network.action_distribution import ActionDistribution
+from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_code import first_line, place_of
-from daedalus.policy.user_modules import UserModuleError, UserModules
-from daedalus.protocol.algorithms import AlgorithmRecord
+from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
+from daedalus.protocol.algorithms import AlgorithmRecord, is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec
 
@@ -83,3 +85,24 @@ def check_updates(
 
 def _fault(name: str, error: Exception) -> AlgorithmError:
     return AlgorithmError(f"{_SETTING}={name}: {first_line(error)}{place_of(error)}")
+
+
+CLASSES: dict[str, type[Algorithm]] = {
+    "a2c": A2c,
+    "a3c": A3c,
+    "impala": Impala,
+    "appo": Appo,
+    "one_step_q": OneStepQ,
+    "one_step_sarsa": OneStepSarsa,
+    "n_step_q": NStepQ,
+}
+
+
+def build_algorithm(spec: LossSpec, distribution: ActionDistribution, modules: UserModules = NO_MODULES) -> Algorithm:
+    """Return the algorithm named by `spec.algorithm`, for a policy with these action distributions.
+
+    `modules` may be imported. Raises AlgorithmError for an algorithm of the user's own that cannot be constructed.
+    """
+    if is_own(spec.algorithm):
+        return own_algorithm(spec, distribution, modules)
+    return CLASSES[spec.algorithm](spec, distribution)

@@ -7,14 +7,171 @@ recording takes 15 ms.
 
 import logging
 import warnings
-from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from daedalus.algorithms.operation_tape import OperationTape
 from daedalus.policy.user_code import first_line
+
+_READS_A_VALUE = torch.ops.aten._local_scalar_dense.default
+
+
+class _Number(NamedTuple):
+    """Stands for a tensor in the arguments of an operation."""
+
+    number: int
+
+
+class _Operation(NamedTuple):
+    """A call of an operation of torch."""
+
+    function: Any  # torch.OpOverload
+    arguments: Sequence[Any]  # tensors as _Number, also in nested lists
+    keywords: Mapping[str, Any]
+    results: Sequence[int]  # the numbers of its tensors
+
+
+class TapeError(Exception):
+    """The operations of a function depend on more than the shapes of its tensors."""
+
+
+class OperationTape(TorchDispatchMode):
+    """The operations that torch does while the tape is entered, to be done again with other tensors.
+
+    A tensor is known by its place in memory, as autograd passes on other objects of the same memory; all tensors of the
+    recording stay in memory until it ends, so that none takes the place of another.
+    """
+
+    def __init__(self, tensors: Sequence[Tensor]) -> None:
+        """Create an empty tape of a function with these arguments."""
+        super().__init__()
+        self.inputs: dict[int, Tensor] = {}  # by number: the arguments, then the other tensors that were used
+        self._operations: list[_Operation] = []
+        self._numbers: dict[tuple[Any, ...], int] = {}  # by place in memory
+        self._kept: list[Tensor] = []  # by number
+        self._made: set[int] = set()  # storages of the arguments and of what operations made
+        self._others: set[int] = set()  # storages of the other inputs
+        for tensor in tensors:
+            self.inputs[self._add(tensor)] = tensor
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # torch would otherwise import torch._dynamo, which takes a second
+
+    @classmethod
+    def of(
+        cls, function: Callable[[Sequence[Tensor]], Sequence[Tensor]], tensors: Sequence[Tensor]
+    ) -> tuple[Self, Callable[..., tuple[Tensor, ...]]]:
+        """Return the tape of a call of a function, and what repeats it for other values of `inputs`, in their order.
+
+        Raises TapeError if the function reads a value.
+        """
+        tape = cls(tensors)
+        with tape:
+            results = function(tensors)
+        numbers = [tape._number(result) for result in results]
+        operations = tape._needed_for(numbers)
+        inputs = tuple(tape.inputs)
+
+        def repeat(*values: Tensor) -> tuple[Tensor, ...]:
+            known = dict(zip(inputs, values, strict=True))
+            for operation in operations:
+                made = operation.function(*_given(operation.arguments, known), **_given(operation.keywords, known))
+                known |= zip(operation.results, _tensors(made), strict=True)
+            return tuple(known[number] for number in numbers)
+
+        return tape, repeat
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        """Do an operation, and record it."""
+        if func is _READS_A_VALUE:
+            raise TapeError("its operations depend on values of its tensors")
+        arguments, keywords = self._numbered(args), self._numbered(kwargs or {})
+        made = func(*args, **(kwargs or {}))
+        tensors = _tensors(made)
+        if func._schema.is_mutable or not all(map(self._is_known, tensors)):
+            self._operations.append(_Operation(func, arguments, keywords, [self._add(each) for each in tensors]))
+        return made
+
+    def _is_known(self, tensor: Tensor) -> bool:
+        """Return whether a result is in its place before the function is called: a view of a parameter, or an alias."""
+        place = _place(tensor)
+        return place in self._numbers or place[0] in self._others
+
+    def _add(self, tensor: Tensor) -> int:
+        number = len(self._kept)
+        self._kept.append(tensor)
+        place = _place(tensor)
+        self._numbers[place] = number
+        if place[0] not in self._others:  # a parameter that an operation writes to is no memory of the operation
+            self._made.add(place[0])
+        return number
+
+    def _number(self, tensor: Tensor) -> int:
+        """Return the number of a tensor. One that no operation made, such as a parameter, becomes an input."""
+        place = _place(tensor)
+        known = self._numbers.get(place)
+        if known is not None:
+            return known
+        if place[0] in self._made:
+            raise TapeError("it uses a part of a tensor that no operation has selected")
+        self._others.add(place[0])
+        number = self._numbers[place] = len(self._kept)
+        self._kept.append(tensor)
+        self.inputs[number] = tensor.detach()
+        return number
+
+    def _numbered(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return _Number(self._number(value))
+        return _mapped(self._numbered, value)
+
+    def _needed_for(self, numbers: Sequence[int]) -> list[_Operation]:
+        """Return the operations without those whose results are not needed."""
+        needed, operations = set(numbers), []
+        for operation in reversed(self._operations):
+            if operation.function._schema.is_mutable or not needed.isdisjoint(operation.results):
+                operations.append(operation)
+                needed.update(_numbers_in((operation.arguments, operation.keywords)))
+        return operations[::-1]
+
+
+def _place(tensor: Tensor) -> tuple[Any, ...]:
+    """Return where a tensor is in memory: its storage, and which part of that."""
+    storage = tensor.untyped_storage().data_ptr()
+    return storage, tensor.storage_offset(), tensor.shape, tensor.stride(), tensor.dtype
+
+
+def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
+    """Return a value with a function applied to the elements of a list, tuple or mapping."""
+    if isinstance(value, Mapping):
+        return {key: function(each) for key, each in value.items()}
+    return [function(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def _given(value: Any, known: Mapping[int, Tensor]) -> Any:
+    if isinstance(value, _Number):
+        return known[value.number]
+    return _mapped(lambda each: _given(each, known), value)
+
+
+def _numbers_in(value: Any) -> set[int]:
+    if isinstance(value, _Number):
+        return {value.number}
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return set().union(*map(_numbers_in, value)) if isinstance(value, list | tuple) else set()
+
+
+def _tensors(made: Any) -> list[Tensor]:
+    """Return the tensors among the results of an operation."""
+    return [each for each in (made if isinstance(made, list | tuple) else [made]) if isinstance(each, Tensor)]
+
 
 EARLIER_CALLS = 20  # before a recording is made, which saves about as many calls of the function
 _LARGEST_NUMBER = 4  # of recordings

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import BatchAssembler
-from daedalus.algorithms.diagnostics import BATCH_METRICS, batch_metrics, diagnostics
+from daedalus.algorithms.diagnostics import BATCH_METRICS, ActionCounts, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, restored, unpacked
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.normalization import Moments, ObservationStatistics, RewardNormalizer, observations_name
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.compact import bfloat16, float32, planes

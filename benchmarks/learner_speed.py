@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.running import machine, table
-from daedalus.algorithms.flat_parameters import FlatParameters
+from daedalus.algorithms.forward import FlatParameters
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.optimizers import Adam
 from daedalus.policy.network.actor_critic import ActorCritic

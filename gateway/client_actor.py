@@ -10,7 +10,7 @@ import numpy as np
 from daedalus.actor.collecting.client_rows import ClientRows, check_run, finished_copy, make_client_rows
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.masks import mask_of_one
+from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.errors import ActorError
 from daedalus.gateway.client_images import check_images
@@ -19,7 +19,7 @@ from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.messages import Act, EndEpisode
 from daedalus.gateway.policy_versions import PolicyVersion
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.spec import ActorSpec

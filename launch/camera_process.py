@@ -22,7 +22,7 @@ from daedalus.gateway.watching.camera import LENGTH, frame, note
 from daedalus.launch.logs import configure_logging
 from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, stop_on_signals
 from daedalus.learner.run.run_directory import run_name
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError

@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from daedalus.gateway.tokens import OPERATOR, TOKENS, digest, new_token
-from daedalus.policy.saving.replacing import replace_text, replacing
+from daedalus.policy.saving.regular_files import replace_text, replacing
 from daedalus.protocol import keys
 from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, KEY, Credentials, CredentialsError

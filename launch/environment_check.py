@@ -22,7 +22,7 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 if TYPE_CHECKING:
-    from daedalus.actor.checking.report import EnvironmentReport
+    from daedalus.actor.checking.check_report import EnvironmentReport
 
 _POLL_SECONDS = 0.2
 _ALARM_SECONDS = 5  # after the limit: a process without its parent ends then, even in native code
@@ -91,7 +91,7 @@ def check_in_process(
 
     Raises CheckTimeoutError.
     """
-    from daedalus.actor.checking.report import EnvironmentReport
+    from daedalus.actor.checking.check_report import EnvironmentReport
 
     reading, writing = os.pipe()
     with open(reading, "rb", buffering=0) as results:
@@ -220,7 +220,7 @@ def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | Non
 
 
 def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "EnvironmentReport":
-    from daedalus.actor.checking.report import EnvironmentReport, advice, slow_start
+    from daedalus.actor.checking.check_report import EnvironmentReport, advice, slow_start
 
     try:
         modules = UserModules(frozenset(modules_of(spec.user_modules)))
@@ -288,7 +288,7 @@ def expected_defaults(
 def _expected(
     spec: RunSpec, modules: UserModules, stop: threading.Event, *, for_settings: bool = False
 ) -> "EnvironmentReport":
-    from daedalus.actor.checking.report import EnvironmentReport
+    from daedalus.actor.checking.check_report import EnvironmentReport
 
     try:
         report = quick_check(spec.environment, modules, play=False, stop=stop, for_settings=for_settings)

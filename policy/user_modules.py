@@ -21,6 +21,10 @@ from typing import Any
 import numpy as np
 
 
+class NetworkError(Exception):
+    """The network of a PolicySpec cannot be built for the spaces; the message says why and what to do."""
+
+
 class UserModuleError(Exception):
     """Error of a module that is not allowed or cannot be imported. The message is one line and says what to do."""
 

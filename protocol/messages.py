@@ -85,6 +85,10 @@ class MetricsReport:
             raise ValueError(f"values must be float64 {list(shape)}, not {self.values.dtype} {self.values.shape}")
 
 
+# Learner epochs have 62 bits: the upper 22 count the starts of a run's learner and the lower 40 are random. A learner
+# that resumes from a checkpoint has a larger epoch than each learner before that checkpoint, whatever the clocks of
+# their hosts say. Of two learners of one run, the one with the larger epoch is the newer: so a run that was continued
+# from a copy goes on there, and not where it was copied from.
 _RANDOM_BITS = 40
 _MOST_STARTS = (1 << 22) - 1
 

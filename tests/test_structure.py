@@ -87,14 +87,7 @@ def test_no_file_imports_a_package_by_its_folder() -> None:
 
 def test_only_the_zenoh_files_of_the_transport_import_zenoh() -> None:
     users = {path.name for package in PACKAGES for path, tree in sources(package) if "zenoh" in imported(tree)}
-    assert users == {
-        "zenoh_transport.py",
-        "zenoh_session.py",
-        "zenoh_callbacks.py",
-        "zenoh_messages.py",
-        "zenoh_declarations.py",
-        "zenoh_senders.py",
-    }
+    assert users == {"zenoh_transport.py", "zenoh_session.py", "zenoh_declarations.py"}
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -2,22 +2,104 @@
 
 import functools
 import re
+import time
 import warnings
 from contextlib import suppress
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium.utils.env_checker import check_env
 
-from daedalus.actor.checking.random_actions import RandomActions
-from daedalus.actor.checking.texts import Texts
+from daedalus.actor.environments.components import is_text, leaves
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
 from daedalus.actor.environments.gymnasium_backend import registration
-from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
+from daedalus.actor.environments.info import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec
+
+
+class RandomActions:
+    """A policy that draws every action at random from those that are legal."""
+
+    def __init__(self, spaces: dict[str, ActionSpace], seed: int) -> None:
+        self._spaces = spaces
+        self._random = np.random.default_rng(seed)
+
+    def choose(self, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return actions {name: [1, D]}, given the masks {name: [1, choices]} of the components that have masks."""
+        return {name: self._values(space, masks.get(name))[None] for name, space in self._spaces.items()}
+
+    def _values(self, space: ActionSpace, mask: np.ndarray | None) -> np.ndarray:
+        match space:
+            case DiscreteSpace():
+                legal = np.ones(space.choices, np.bool_) if mask is None else mask[0]
+                parts = np.split(legal, np.cumsum(space.counts)[:-1])
+                return np.array([self._random.choice(np.flatnonzero(part)) for part in parts])
+            case ContinuousSpace():
+                bounded = [None not in bounds for bounds in zip(space.low, space.high, strict=True)]
+                uniform, normal = self._random.uniform(-1.0, 1.0, space.size), self._random.standard_normal(space.size)
+                return np.where(bounded, uniform, normal).astype(np.float32)
+
+
+_RESETS, _SECONDS = 20, 2.0  # the most resets, and the time for those after the second
+_SHOWN = 60  # characters of a text in a message
+
+
+class Texts:
+    """The texts of one environment, and whether they change."""
+
+    def __init__(self, space: gymnasium.Space, leave_out: tuple[str, ...]) -> None:
+        """Construct from the observation space, and the names of the components that nobody reads."""
+        found = leaves(space, "observation")
+        self._leaves = [leaf for leaf in found if leaf.path and is_text(leaf.space) and leaf.name not in leave_out]
+        self._seen: dict[str, list[str]] = {leaf.name: [] for leaf in self._leaves}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the components that are texts."""
+        return tuple(self._seen)
+
+    @property
+    def constant(self) -> dict[str, str]:
+        """The texts that never changed, by component."""
+        return {name: seen[0] for name, seen in self._seen.items() if len(seen) == 1}
+
+    @property
+    def problem(self) -> str:
+        """A description of the first text that changes, or an empty string."""
+        for name, seen in self._seen.items():
+            if len(seen) > 1:
+                return (
+                    f"observation component {name!r} is a text that changes ({_shown(seen[0])}, {_shown(seen[1])}): "
+                    "make numbers of it with --wrap MODULE:FUNCTION, or leave it out if the policy does not need it: "
+                    f"--set \"environment.leave_out=['{name}']\""
+                )
+        return ""
+
+    def watch(self, environment: gymnasium.Env, seed: int) -> None:
+        """Reset the environment several times: a text may be another in each episode."""
+        until = time.monotonic() + _SECONDS
+        with suppress(Exception, SystemExit):  # of the user's code; playing reports it
+            for episode in range(_RESETS if self._leaves else 0):
+                self.add(environment.reset(seed=seed + episode)[0])
+                if episode > 0 and time.monotonic() > until:
+                    return
+
+    def add(self, observation: Any) -> None:
+        """Take note of the texts of an observation."""
+        for leaf in self._leaves:
+            text, seen = str(leaf.of(observation)), self._seen[leaf.name]
+            if text not in seen and len(seen) < 2:
+                seen.append(text)
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m|^WARN: ")
 

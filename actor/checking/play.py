@@ -9,29 +9,180 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
-from daedalus.actor.checking.random_actions import RandomActions
-from daedalus.actor.checking.report import EnvironmentReport
-from daedalus.actor.checking.single import make_one
-from daedalus.actor.checking.statistics import unsaved_statistics
-from daedalus.actor.checking.texts import Texts
-from daedalus.actor.checking.vectorized import vectorized_problem
+from daedalus.actor.checking.check_report import EnvironmentReport
+from daedalus.actor.checking.checker import RandomActions, Texts
 from daedalus.actor.checking.violations import (
     Violation,
     learned_reward_violations,
+    observation_violations,
     reset_violations,
     step_violations,
 )
-from daedalus.actor.environments.closing import limited_close
+from daedalus.actor.environments.components import batch_of_one, only_of_batch, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.leaves import without
-from daedalus.actor.environments.masks import MASK_KEY, has_choices, mask_of_one
+from daedalus.actor.environments.gymnasium_backend import make_single, uses_vector_entry_point
+from daedalus.actor.environments.gymnasium_environments import limited_close
+from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks
+from daedalus.actor.environments.interface import BackendEnvironments, Observed
+from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.precision import Precision
-from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
 from daedalus.policy.user_code import first_line, place_of
-from daedalus.policy.user_modules import USER_STATE, UserModules
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
+from daedalus.protocol.spaces import ArraySpace, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
+
+
+class OneOfVector(gymnasium.Env):
+    """The only environment of a vector: its steps after the end of an episode are resets here."""
+
+    def __init__(self, environments: BackendEnvironments) -> None:
+        self._environments = environments
+        self.observation_space, self.action_space = environments.observation_space, environments.action_space
+        self._started = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin the next episode; only the first one has a seed."""
+        if self._started:
+            observations = self._environments.step(self._batched(self.action_space.sample()))[0]
+        else:
+            observations, self._started = self._environments.reset(seed or 0), True
+        return only_of_batch(self.observation_space, observations), self._info()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See gymnasium.Env."""
+        observations, rewards, terminated, truncated = self._environments.step(self._batched(action))
+        observation = only_of_batch(self.observation_space, observations)
+        return observation, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info()
+
+    def _batched(self, action: Any) -> Any:
+        return batch_of_one(self.action_space, action, "the action")
+
+    def _info(self) -> dict[str, Any]:
+        mask = self._environments.action_mask
+        return {} if mask is None else {MASK_KEY: only_of_masks(mask)}
+
+    def close(self) -> None:
+        """See gymnasium.Env."""
+        self._environments.close()
+
+
+def make_one(spec: EnvironmentSpec, modules: UserModules) -> tuple[gymnasium.Env, EnvironmentSpec]:
+    """Return one environment in this process, and the specification without what the backend does itself.
+
+    Raises EnvironmentSetupError.
+    """
+    try:
+        modules.check(spec.user_modules)
+    except UserModuleError as error:
+        raise EnvironmentSetupError(str(error)) from None
+    single = make_single(spec, modules) if spec.backend in ("gymnasium", "fast") else None
+    if single is not None:
+        _check_spaces(single, spec.id)
+        return single, spec
+    environments, rest = make_bare(spec.model_copy(update={"processes": False}), 1, modules)
+    return OneOfVector(environments), rest
+
+
+def _check_spaces(environment: gymnasium.Env, name: str) -> None:
+    """Close an environment whose spaces cannot be read, and raise EnvironmentSetupError."""
+    for attribute in ("observation_space", "action_space"):
+        try:
+            getattr(environment, attribute)
+        except (Exception, SystemExit) as error:  # of the user's code
+            with suppress(Exception, SystemExit):
+                environment.close()
+            raise EnvironmentSetupError(
+                f"environment {name} has no {attribute} ({first_line(error)}): set it in the constructor"
+            ) from None
+
+
+_COUNT, _STEPS, _SECONDS = 2, 50, 1.0  # few: one environment was played before
+
+
+def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spaces, seed: int) -> str:
+    """Return what is wrong with the vector entry point, or an empty string, also if training does not use one.
+
+    Args:
+      spec: the environment and its transforms.
+      modules: the modules that may be imported for it.
+      spaces: of one environment that was made without the vector entry point.
+      seed: of the environments and the actions.
+    """
+    try:
+        if not uses_vector_entry_point(spec, modules):
+            return ""
+        bare, rest = make_bare(spec, _COUNT, modules)
+        try:
+            if problem := _observations_problem(bare, spec, seed):
+                return f"environment {spec.id}: {problem} (training uses its vector entry point)"
+            environments = TransformedEnvironment(bare, rest)
+            if environments.spaces != spaces:
+                return (
+                    f"environment {spec.id}: its vector entry point has {environments.spaces}, "
+                    f"but its entry point has {spaces}"
+                )
+            random, until = RandomActions(spaces.actions, seed), time.monotonic() + _SECONDS
+            observed = environments.reset(seed)
+            for _ in range(_STEPS):
+                observed, rewards, *_ = environments.step(_chosen(random, observed.masks))
+                if problem := _numbers_problem(observed, rewards):
+                    return f"environment {spec.id}: step returns {problem} (training uses its vector entry point)"
+                if time.monotonic() > until:
+                    break
+        finally:
+            bare.close()
+    except EnvironmentSetupError as error:
+        return f"{error} (training uses its vector entry point)"
+    return ""
+
+
+def _observations_problem(environments: BackendEnvironments, spec: EnvironmentSpec, seed: int) -> str:
+    """Return what makes the first observations differ from their space, or an empty string."""
+    space = without(environments.observation_space, spec.leave_out)
+    observations = environments.reset(seed)
+    try:
+        rows = list(iterate(batch_space(environments.observation_space, _COUNT), observations))
+    except Exception as error:  # broad: they may be anything
+        return f"reset returns observations that are no batch of observation_space ({first_line(error)})"
+    if len(rows) != _COUNT:
+        return f"reset returns {len(rows)} observations for {_COUNT} environments"
+    found = (violation for row in rows for violation in observation_violations(space, row, "reset"))
+    return next((text for kind, text in found if kind == "problem"), "")
+
+
+def _numbers_problem(observed: Observed, rewards: np.ndarray) -> str:
+    """Return what the learner would refuse, or an empty string."""
+    for name, frames in observed.frames.items():
+        if unfit := unfit_number(frames):
+            return f"an observation whose component {name!r} {unfit}"
+    faulty = ~np.isfinite(rewards)
+    return f"the reward {rewards[faulty][0]}: it must be finite" if faulty.any() else ""
+
+
+def _chosen(random: RandomActions, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return an action for each environment, {name: [E, D]}, given the masks {name: [E, choices]}."""
+    rows = [random.choose({name: mask[row][None] for name, mask in masks.items()}) for row in range(_COUNT)]
+    return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+
+
+def unsaved_statistics(environment: gymnasium.Env) -> tuple[str, ...]:
+    """Return a warning for each wrapper of an environment that normalises by statistics of its own."""
+    warnings: list[str] = []
+    while isinstance(environment, gymnasium.Wrapper):
+        if isinstance(environment, NormalizeObservation | NormalizeReward) and environment.update_running_mean:
+            name = type(environment).__name__
+            setting = "policy.normalize_observations"
+            if isinstance(environment, NormalizeReward):
+                setting = "training.normalize_rewards"
+            warnings.append(
+                f"wrapper {name} has statistics of its own in each environment, which are not saved: evaluations begin "
+                f"without them; use --set {setting}=true in its place"
+            )
+        environment = environment.env
+    return tuple(warnings)
 
 
 class _ProblemError(Exception):

@@ -10,8 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.components import dtype_misfit
-from daedalus.actor.environments.leaves import LeftOut
+from daedalus.actor.environments.components import LeftOut, dtype_misfit
 from daedalus.protocol.spaces import LARGEST_OBSERVATION, LARGEST_REWARD
 from daedalus.protocol.spec import EnvironmentSpec
 

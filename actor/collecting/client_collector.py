@@ -13,8 +13,8 @@ from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPoli
 from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
-from daedalus.actor.environments.leaves import without
-from daedalus.actor.environments.masks import mask_of_one
+from daedalus.actor.environments.components import without
+from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.protocol.messages import Snapshot

@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.bounds import BoundedActions, continuous_space
+from daedalus.actor.environments.components import BoundedActions, continuous_space
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
 

@@ -1,9 +1,11 @@
 """The environment's nested spaces as flat maps of named components, and values of one in the other. Pure functions.
 
-A component is a leaf of the nested space, see leaves.py.
+A component is a leaf of the nested space. It is named by the keys and indices that lead to it, joined by dots; a space
+that is not composite has the name `observation` or `action`.
 """
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -11,10 +13,160 @@ import numpy as np
 from gymnasium import spaces as gym
 from pydantic import ValidationError
 
-from daedalus.actor.environments.bounds import BoundedActions, continuous_space
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
-from daedalus.actor.environments.leaves import Leaf, LeftOut, leaves
-from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
+from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
+
+_LONGEST_NAME = 64  # ComponentName of the protocol
+
+
+class Leaf(NamedTuple):
+    """A space that is not composite, and where it is in the nested space."""
+
+    name: str
+    path: tuple[str | int, ...]
+    space: gymnasium.Space
+
+    def of(self, value: Any) -> np.ndarray:
+        """Return this component of a nested value; in a batch each component has the first axis E."""
+        for key in self.path:
+            value = value[key]
+        return np.asarray(value)
+
+
+def leaves(space: gymnasium.Space, whole: str) -> tuple[Leaf, ...]:
+    """Return all leaves of a nested space, in gymnasium's order. `whole` is the name of a space that is not composite.
+
+    Of leaves that would have the same name, as keys in Chinese may, the second is numbered 2, and so on. Raises
+    EnvironmentSetupError if there are none.
+    """
+    found: dict[str, Leaf] = {}
+    for path, leaf in _walk(space, ()):
+        name = _unused(_name(path) if path else whole, found)
+        found[name] = Leaf(name, path, leaf)
+    if not found:
+        raise EnvironmentSetupError(f"{whole} space {described(space)} is empty: it must have at least one component")
+    return tuple(found.values())
+
+
+def _walk(space: gymnasium.Space, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    if isinstance(space, gym.Dict):
+        for key, part in space.spaces.items():
+            yield from _walk(part, (*path, key))
+    elif isinstance(space, gym.Tuple):
+        for index, part in enumerate(space.spaces):
+            yield from _walk(part, (*path, index))
+    else:
+        yield path, space
+
+
+def _name(path: tuple[str | int, ...]) -> str:
+    """Return the keys in the letters that a name may have, joined by dots: the last 64, which tell most."""
+    return ".".join(re.sub(r"[^\w-]", "_", str(key), flags=re.ASCII) or "_" for key in path)[-_LONGEST_NAME:]
+
+
+def _unused(name: str, used: Collection[str]) -> str:
+    """Return a name that is not used yet, with a number at its end if need be."""
+    unused, number = name, 1
+    while unused in used:
+        number += 1
+        ending = f"_{number}"
+        unused = name[: _LONGEST_NAME - len(ending)] + ending
+    return unused
+
+
+class LeftOut(gymnasium.Space):
+    """The place of a component that the policy does not see."""
+
+
+def without(space: gymnasium.Space, names: Sequence[str]) -> gymnasium.Space:
+    """Return an observation space whose components of these names are LeftOut.
+
+    Raises EnvironmentSetupError for a name that is no component.
+    """
+    if not names:
+        return space
+    components = {leaf.name: leaf.path for leaf in leaves(space, "observation")}
+    unknown = [name for name in names if name not in components]
+    if unknown:
+        raise EnvironmentSetupError(
+            f"environment.leave_out names {unknown[0]!r}, but the components of the observation are "
+            f"{', '.join(components)}"
+        )
+    return _without(space, (), {components[name] for name in names})
+
+
+def _without(space: Any, path: tuple[str | int, ...], paths: Collection[tuple[str | int, ...]]) -> gymnasium.Space:
+    if path in paths:
+        return LeftOut()
+    if isinstance(space, gym.Dict):
+        return gym.Dict({key: _without(part, (*path, key), paths) for key, part in space.spaces.items()})
+    if isinstance(space, gym.Tuple):
+        return gym.Tuple([_without(part, (*path, index), paths) for index, part in enumerate(space.spaces)])
+    return space
+
+
+_UNBOUNDED = 1e30  # a bound beyond this value is none: environments write the largest float for infinity
+_WIDE_BYTES = 4  # integers of fewer bytes use all their range, such as the colours of a pixel
+
+
+def continuous_space(space: gymnasium.spaces.Box) -> ContinuousSpace:
+    """Return the run's space for the actions of a Box, flattened. Raises ValidationError if it is not supported."""
+    return ContinuousSpace(low=_bounds(space.low), high=_bounds(space.high))
+
+
+class BoundedActions:
+    """Actions of a Box for the values that a policy chooses: [-1, 1] is scaled to the bounds where there are two."""
+
+    def __init__(self, space: gymnasium.spaces.Box) -> None:
+        self._space = space
+        self._low, self._high = space.low.ravel().astype(np.float64), _highest(space.high)
+        if space.dtype == np.float16:  # without a bound, it cannot hold every number of a policy
+            largest = float(np.finfo(np.float16).max)
+            self._low, self._high = np.maximum(self._low, -largest), np.minimum(self._high, largest)
+        self._bounded = _is_bound(space.low) & _is_bound(space.high)
+        with np.errstate(invalid="ignore", over="ignore"):
+            self._range = self._high - self._low
+            self._centre = np.where(self._bounded, self._low + 0.5 * self._range, 0.0).clip(self._low, self._high)
+        self._rounded = space.dtype is not None and space.dtype.kind != "f"
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Return actions of the environment [E, *shape], within its bounds, for values [E, D]."""
+        if self._bounded.all():
+            scaled = self._low + (values.astype(np.float64) + 1.0) * 0.5 * self._range
+        else:
+            with np.errstate(invalid="ignore", over="ignore"):
+                scaled = self._low + (values.astype(np.float64) + 1.0) * 0.5 * self._range
+            scaled = np.where(self._bounded, scaled, values)
+        actions = np.minimum(np.maximum(scaled, self._low), self._high)
+        # Of a policy that saw a value that is not finite. The learner refuses the row; but an environment that gets
+        # such an action may return nothing finite any more, and an integer would be any.
+        actions = np.where(np.isnan(actions), self._centre, actions)
+        if self._rounded:
+            actions = np.rint(actions)
+        return actions.reshape(len(values), *self._space.shape).astype(self._space.dtype)
+
+
+def _bounds(values: np.ndarray) -> tuple[float | None, ...]:
+    numbers = values.ravel().astype(np.float64)
+    return tuple(float(value) if is_bound else None for value, is_bound in zip(numbers, _is_bound(values), strict=True))
+
+
+def _highest(values: np.ndarray) -> np.ndarray:
+    """Return upper bounds as float64 that the dtype of the bounds can hold: the largest int64 is rounded up."""
+    bounds = values.ravel().astype(np.float64)
+    if values.dtype.kind not in "iu":
+        return bounds
+    return np.where(bounds >= float(np.iinfo(values.dtype).max) + 1.0, np.nextafter(bounds, 0.0), bounds)
+
+
+def _is_bound(values: np.ndarray) -> np.ndarray:
+    """Return whether each number limits anything. gymnasium writes the largest integer for infinity."""
+    bounds = np.abs(values.ravel().astype(np.float64)) < _UNBOUNDED
+    if values.dtype.kind in "iu" and values.dtype.itemsize >= _WIDE_BYTES:
+        limits = np.iinfo(values.dtype)
+        bounds &= (values.ravel() != limits.max) & ((values.ravel() != limits.min) | (limits.min == 0))
+    return bounds
+
 
 _MAX_DIMENSIONS = 4
 

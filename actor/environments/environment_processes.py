@@ -24,15 +24,14 @@ from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import _async_worker
 
-from daedalus.actor.environments.components import is_text
+from daedalus.actor.environments.components import is_text, leaves
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     creation_errors,
     hint_of_count,
     playing_error,
 )
-from daedalus.actor.environments.episode_info import info_to_keep
-from daedalus.actor.environments.leaves import leaves
+from daedalus.actor.environments.info import info_to_keep
 from daedalus.actor.environments.wrappers import OfItsSpace
 
 _CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a video

@@ -19,9 +19,8 @@ from daedalus.actor.environments.environment_errors import (
     unknown_to_gymnasium,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
-from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
-from daedalus.actor.environments.masks import has_choices
+from daedalus.actor.environments.gymnasium_environments import EnvironmentsInTurn, GymnasiumEnvironments
+from daedalus.actor.environments.info import has_choices
 from daedalus.actor.environments.rendering import CountedSteps, render_without_display
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_code import first_line

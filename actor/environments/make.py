@@ -67,7 +67,7 @@ def make_bare(
 
             return make_envpool(spec, count)
         case "ale":
-            from daedalus.actor.environments.ale_backend import make_ale
+            from daedalus.actor.environments.atari import make_ale
 
             return make_ale(spec, count)
         case "gymnasium" | "fast":

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from daedalus.actor.environments.leaves import leaves
+from daedalus.actor.environments.components import leaves
 
 _NOISE = 1e-12  # relative: smaller differences may be the rounding of float64 itself
 _FEW_STEPS = 1000  # of float32, from bound to bound or from the smallest to the largest value: too coarse to act on

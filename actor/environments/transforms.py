@@ -14,11 +14,11 @@ from daedalus.actor.environments.components import (
     batch_of_one,
     observation_components,
     only_of_batch,
+    without,
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
+from daedalus.actor.environments.info import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
-from daedalus.actor.environments.leaves import without
-from daedalus.actor.environments.masks import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec

@@ -9,10 +9,9 @@ import numpy as np
 from gymnasium import spaces as gym
 
 from daedalus.actor.checking.violations import observation_violations
-from daedalus.actor.environments.components import dtype_misfit
+from daedalus.actor.environments.components import dtype_misfit, leaves, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.leaves import leaves, without
-from daedalus.actor.environments.masks import MASK_KEY
+from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.rendering import CountedSteps, FrameRate, frame_rate
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import USER_STATE

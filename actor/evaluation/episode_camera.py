@@ -10,7 +10,7 @@ import numpy as np
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.rendering import FrameRate
-from daedalus.actor.evaluation.running_episodes import RunningEpisodes, refuse_unfit_rewards
+from daedalus.actor.evaluation.episodes import RunningEpisodes, refuse_unfit_rewards
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.policy.user_modules import UserModules

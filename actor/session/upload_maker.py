@@ -47,7 +47,7 @@ def make_upload_maker(spec: ActorSpec, spaces: Spaces, modules: UserModules) -> 
         modules.check(learning.user_modules)
         from daedalus.algorithms.errors import AlgorithmError
         from daedalus.algorithms.rollout_gradients import RolloutGradients
-        from daedalus.policy.network.errors import NetworkError
+        from daedalus.policy.user_modules import NetworkError
     except (UnsupportedRunError, UserModuleError) as error:
         raise ActorError(str(error)) from None
     except ModuleNotFoundError as error:

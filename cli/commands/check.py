@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from daedalus.actor.checking.report import EnvironmentReport, advice, never_ends
+from daedalus.actor.checking.check_report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
 from daedalus.launch.environment_check import CheckTimeoutError, EnvironmentCheck, check_in_process, with_preset
@@ -166,7 +166,7 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     from daedalus.policy.acting.program import export_program
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
-    from daedalus.policy.network.errors import NetworkError
+    from daedalus.policy.user_modules import NetworkError
 
     try:
         network = ActorCritic(spec.policy, spaces, modules, spec.training)

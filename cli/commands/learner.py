@@ -63,11 +63,10 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
-from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_words, modules_of
+from daedalus.policy.user_modules import ModuleNotAllowedError, NetworkError, UserModuleError, allow_words, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.credentials import (

@@ -14,7 +14,7 @@ from daedalus.cli.reports.page import comparison_page, run_page
 from daedalus.cli.reports.run_record import RunRecord, read_record
 from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
-from daedalus.policy.saving.replacing import replace_text
+from daedalus.policy.saving.regular_files import replace_text
 
 _DESCRIPTION = """\
 Writes one HTML file about a run: settings, curves, statistics and a histogram of the evaluation, a video if there is

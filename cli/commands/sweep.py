@@ -25,7 +25,7 @@ from daedalus.launch.process_lifecycle import stop_on_signals
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.saving.replacing import replace_text
+from daedalus.policy.saving.regular_files import replace_text
 
 _DESCRIPTION = """\
 Trains runs of several settings, each with several seeds, one after another or side by side (--jobs). Ends with a table

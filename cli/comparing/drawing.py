@@ -12,7 +12,7 @@ from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import RETURN
 from daedalus.cli.comparing.statistics import performance_profile, profile_interval
 from daedalus.learner.run.run_files import RunDataError
-from daedalus.policy.saving.replacing import replacing
+from daedalus.policy.saving.regular_files import replacing
 from daedalus.protocol.texts import one_line
 
 if TYPE_CHECKING:

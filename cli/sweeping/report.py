@@ -14,7 +14,7 @@ from daedalus.cli.comparing.tables import as_csv, as_text
 from daedalus.cli.sweeping.plan import PlannedRun
 from daedalus.cli.sweeping.sweep import SweepEnd
 from daedalus.learner.run.run_files import RunDataError
-from daedalus.policy.saving.replacing import replacing
+from daedalus.policy.saving.regular_files import replacing
 from daedalus.protocol.texts import one_line
 
 TABLE, RUNS, CURVES = "table.csv", "runs.csv", "curves.png"

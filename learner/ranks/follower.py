@@ -18,9 +18,8 @@ from daedalus.learner.ranks.leader import exchange, report_first_pass
 from daedalus.learner.ranks.parts import bounds_of
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
-from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.user_code import message_line
-from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
+from daedalus.policy.user_modules import NO_MODULES, NetworkError, UserModuleError, UserModules
 from daedalus.protocol.spaces import Spaces
 
 _logger = logging.getLogger(__name__)

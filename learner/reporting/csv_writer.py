@@ -13,8 +13,7 @@ import numpy as np
 
 from daedalus.learner.reporting.metrics import COLUMNS, Details
 from daedalus.learner.reporting.metrics_file import lasting, numbers
-from daedalus.policy.saving.regular_files import append_own
-from daedalus.policy.saving.replacing import replacing
+from daedalus.policy.saving.regular_files import append_own, replacing
 from daedalus.protocol.texts import exact_number
 
 _BLOCK_BYTES = 1 << 16

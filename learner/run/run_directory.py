@@ -30,7 +30,7 @@ from daedalus.learner.run import run_files
 from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
 from daedalus.learner.run.settings import SettingsError, as_toml, read_settings, run_spec
-from daedalus.policy.saving.replacing import replace_text
+from daedalus.policy.saving.regular_files import replace_text
 from daedalus.protocol import keys
 from daedalus.protocol.spec import RunSpec
 

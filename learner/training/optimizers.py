@@ -1,4 +1,4 @@
-"""Adam and RMSProp over one flat vector of all parameters (daedalus/algorithms/flat_parameters.py).
+"""Adam and RMSProp over one flat vector of all parameters (daedalus/algorithms/forward.py).
 
 A checkpoint holds one vector for each statistic. This file calls the kernel of torch's optimiser, because the first
 construction of a torch optimiser class imports torch's compiler, which takes as long as a whole CartPole run, and its

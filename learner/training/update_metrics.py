@@ -6,9 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import Batch
-from daedalus.algorithms.diagnostics import BATCH_METRICS
+from daedalus.algorithms.diagnostics import BATCH_METRICS, ActionCounts
 from daedalus.algorithms.gradients import Terms
 from daedalus.protocol.spaces import ArraySpace, Spaces
 

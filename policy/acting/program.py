@@ -28,8 +28,8 @@ from daedalus.policy.acting.runtime import (
     observation_name,
 )
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.user_code import first_line
+from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 _OPSET = 17

@@ -7,7 +7,10 @@ of a program runs at most once for each call.
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from daedalus.policy.acting.errors import PolicyError
+
+class PolicyError(Exception):
+    """A program or weights that do not fit together or do not fit the spaces: a fault of the sender."""
+
 
 MAX_PROGRAM_BYTES = 16 << 20  # the weights are not part of a program
 MAX_NODES = 4096

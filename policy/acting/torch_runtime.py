@@ -6,7 +6,7 @@ import torch
 from daedalus.policy.acting.noise import Noise, NoiseSize, no_exploration
 from daedalus.policy.acting.runtime import Choice, PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import LossSpec, PolicySpec
 

@@ -3,12 +3,11 @@
 import numpy as np
 import torch
 
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_code import message_line
-from daedalus.policy.user_modules import UserModules
+from daedalus.policy.user_modules import NetworkError, UserModules
 from daedalus.protocol.spaces import DiscreteSpace
 
 

@@ -5,11 +5,10 @@ from contextlib import nullcontext
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.network.components import Components
-from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.network.action_distribution import ActionDistribution
 from daedalus.policy.network.encoders import build_encoder
 from daedalus.policy.network.exploration import Exploration
-from daedalus.policy.network.layers import orthogonal
+from daedalus.policy.network.layers import Components, orthogonal
 from daedalus.policy.network.memory import Gru, NoMemory
 from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.policy.normalized import normalized_components

@@ -10,13 +10,11 @@ from itertools import chain
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.network.choices import variables_and_values
-from daedalus.policy.network.components import Components
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
 from daedalus.policy.network.custom_encoder import CustomEncoder
-from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.network.layers import Components, variables_and_values
 from daedalus.policy.network.perceptron import Perceptron
-from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.policy.user_modules import NO_MODULES, NetworkError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces
 from daedalus.protocol.spec import PolicySpec
 

@@ -5,12 +5,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.network.components import Components
-from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
-from daedalus.policy.network.distributions.distribution import Distribution
-from daedalus.policy.network.distributions.joint import ActionDistribution
-from daedalus.policy.network.distributions.uniform import Uniform
-from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.network.action_distribution import ActionDistribution
+from daedalus.policy.network.distributions import Categorical, Distribution, Uniform, without_illegal
+from daedalus.policy.network.layers import Components
+from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 
 ANNEALING = "exploration.annealing"  # name of the parameter in a network

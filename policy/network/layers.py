@@ -1,10 +1,31 @@
 """Layers that torch does not have, or that are slower in torch."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from daedalus.policy.user_modules import NetworkError, UserModules
+
+Components = dict[str, Tensor]
+
+
+def map_components(components: Components, function: Callable[[Tensor], Tensor]) -> Components:
+    """Return the components with `function` applied to each."""
+    return {name: function(values) for name, values in components.items()}
+
+
+def variables_and_values(counts: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Return the variable and the value of each choice, both [choices] int64.
+
+    Of variables with 2 and 3 choices they are 0 0 1 1 1 and 0 1 0 1 2.
+    """
+    sizes = torch.tensor(counts)
+    variables = torch.arange(len(counts)).repeat_interleave(sizes)
+    return variables, torch.arange(len(variables)) - (sizes.cumsum(0) - sizes)[variables]
+
 
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
 
@@ -66,3 +87,19 @@ class _Rectify(torch.autograd.Function):
 def _pixels(images: Tensor) -> Tensor:
     """Flatten [N, C, H, W] to [N, H * W * C]; a view if the images are channels_last."""
     return images.movedim(1, -1).flatten(1)
+
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+def find_class(setting: str, reference: str, base: type[Module], modules: UserModules) -> type[Module]:
+    """Return the class `module:Class` that a setting names.
+
+    Raises UserModuleError if the module may not be imported or has no such name, and NetworkError if it names something
+    else than a class derived from `base`.
+    """
+    found = modules.attribute(setting, reference)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        kind = "torch.nn.Module" if base is nn.Module else base.__name__
+        raise NetworkError(f"it is not a class of {kind}: name a class of your module")
+    return found

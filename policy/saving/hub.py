@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.policy.saving.replacing import replace_text
+from daedalus.policy.saving.regular_files import replace_text
 from daedalus.policy.saving.saved_policy import POLICY_LIMITS
 from daedalus.policy.saving.sealed import MANIFEST, MAX_MANIFEST_BYTES, SEAL
 from daedalus.protocol.texts import bounded_text

@@ -8,10 +8,40 @@ whoever writes into an existing run directory asks `foreign_entry` first, and op
 import errno
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
+
+
+@contextmanager
+def replacing(path: Path, *, private: bool = False) -> Iterator[Path]:
+    """Yield the path of a new, empty file, which takes the place of `path` at the end; after an error it is removed.
+
+    Args:
+      path: it keeps its content, if it exists, until then.
+      private: only its owner may read the new file.
+
+    Raises OSError.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with suppress(FileNotFoundError):  # of a process of this number, or a link of somebody else
+            beside.unlink()
+        os.close(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o666))
+        yield beside
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str, *, private: bool = False) -> None:
+    """Write a text in UTF-8, as `replacing` does. Raises OSError."""
+    with replacing(path, private=private) as beside:
+        beside.write_text(text, "utf-8")
+
 
 _NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # Windows has no FIFOs in folders
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)

@@ -13,9 +13,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, Tuple
 from gymnasium.wrappers import NormalizeObservation
 from plain import plain_spaces
 
-from daedalus.actor.checking.checker import gymnasium_notes
-from daedalus.actor.checking.play import check_environment
-from daedalus.actor.checking.report import (
+from daedalus.actor.checking.check_report import (
     EnvironmentReport,
     advice,
     float_images,
@@ -24,7 +22,8 @@ from daedalus.actor.checking.report import (
     stacked_images,
     uninformative_bounds,
 )
-from daedalus.actor.checking.statistics import unsaved_statistics
+from daedalus.actor.checking.checker import gymnasium_notes
+from daedalus.actor.checking.play import check_environment, unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
 from daedalus.actor.environments.precision import Precision
 from daedalus.policy.user_modules import UserModules

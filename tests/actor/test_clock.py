@@ -1,8 +1,8 @@
-"""actor/clock.py with a time that the test makes pass."""
+"""actor/client.py with a time that the test makes pass."""
 
 import pytest
 
-from daedalus.actor.clock import Clock
+from daedalus.actor.client import Clock
 
 
 class Time:

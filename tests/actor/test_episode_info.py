@@ -9,7 +9,7 @@ from collectors import collect, started_collector
 from counting_environment import Counting
 from plain import PlainPolicy
 
-from daedalus.actor.environments.episode_info import EpisodeInfo, info_to_keep
+from daedalus.actor.environments.info import EpisodeInfo, info_to_keep
 from daedalus.protocol.spec import EnvironmentSpec
 
 ENDED = np.array([True, False, True, True])

@@ -12,7 +12,7 @@ from scripted_learner import SPACES, Policy, ScriptedLearner
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.service import ActorService
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spec import PolicySpec, RunSpec

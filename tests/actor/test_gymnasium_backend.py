@@ -21,7 +21,7 @@ from picture_environment import Picture
 from plain import PlainEnvironments, choices
 from processes import LIMIT, until
 
-from daedalus.actor.environments import closing, environment_processes, gymnasium_backend, make
+from daedalus.actor.environments import environment_processes, gymnasium_backend, gymnasium_environments, make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium, make_gymnasium
@@ -413,8 +413,8 @@ def test_close_that_does_not_return_is_given_up(
     count: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """What an evaluation has played would be lost."""
-    monkeypatch.setattr(closing, "CLOSE_SECONDS", 0.3)
-    monkeypatch.setattr(closing, "_NEXT_SECONDS", 0.1)
+    monkeypatch.setattr(gymnasium_environments, "CLOSE_SECONDS", 0.3)
+    monkeypatch.setattr(gymnasium_environments, "_NEXT_SECONDS", 0.1)
     environments = make_environments(_faulty("close alone"), count, modules=FAULTY)
     environments.reset(1)
     environments.step(np.zeros(count, np.int64))

@@ -13,8 +13,8 @@ from plain import PlainPolicy
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.policy.acting.noise import Noise

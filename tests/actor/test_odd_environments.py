@@ -13,7 +13,7 @@ from plain import PlainPolicy
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
+from daedalus.actor.environments.gymnasium_environments import EnvironmentsInTurn
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import UserModules

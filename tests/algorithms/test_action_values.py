@@ -19,7 +19,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout

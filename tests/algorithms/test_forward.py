@@ -4,8 +4,7 @@ import pytest
 import torch
 from building import POLICY, SPACES
 
-from daedalus.algorithms.flat_parameters import FlatParameters
-from daedalus.algorithms.forward import Forward
+from daedalus.algorithms.forward import FlatParameters, Forward
 from daedalus.policy.network.actor_critic import ActorCritic
 
 

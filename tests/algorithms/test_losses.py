@@ -19,7 +19,7 @@ from daedalus.algorithms.losses import (
     variance,
 )
 from daedalus.algorithms.returns import Targets
-from daedalus.policy.network.distributions.categorical import Categorical
+from daedalus.policy.network.distributions import Categorical
 from daedalus.protocol.spaces import DiscreteSpace
 
 ROWS, COLUMNS = 5, 3

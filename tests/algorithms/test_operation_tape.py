@@ -1,4 +1,4 @@
-"""algorithms/operation_tape.py: the operations of a function are repeated with other tensors, or it says why not."""
+"""algorithms/recording.py: the operations of a function are repeated with other tensors, or it says why not."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from daedalus.algorithms.operation_tape import OperationTape, TapeError
+from daedalus.algorithms.recording import OperationTape, TapeError
 
 
 def repeated(

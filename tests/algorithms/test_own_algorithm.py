@@ -15,7 +15,7 @@ from daedalus.launch.run_choice import with_record
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
 from daedalus.protocol.compact import bfloat16, float32
 from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
@@ -24,8 +24,8 @@ MODULE = "own_algorithms"
 CODE = """
 import torch
 from daedalus.algorithms.algorithm import Algorithm
-from daedalus.algorithms.appo import Appo
-from daedalus.algorithms.a3c import A3c
+from daedalus.algorithms.policy_gradient import Appo
+from daedalus.algorithms.policy_gradient import A3c
 from daedalus.protocol.algorithms import AlgorithmRecord
 
 class Barrier(A3c):

@@ -1,9 +1,9 @@
-"""algorithms/precision.py: which devices are known to be faster with bfloat16."""
+"""algorithms/gradients.py: which devices are known to be faster with bfloat16."""
 
 import pytest
 import torch
 
-from daedalus.algorithms.precision import is_mixed
+from daedalus.algorithms.gradients import is_mixed
 
 
 @pytest.mark.parametrize("in_hardware", [True, False])

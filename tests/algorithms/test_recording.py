@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms import recording
-from daedalus.algorithms.appo import Appo
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.gradients import GradientComputer
+from daedalus.algorithms.policy_gradient import Appo
 from daedalus.algorithms.recording import OperationRecorder
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces

@@ -19,7 +19,7 @@ from daedalus.algorithms.policy_gradient import PolicyGradient
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.learner.serving.gradient_checks import gradient_violation, restored
 from daedalus.learner.training.learner import Learner
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.codec import decode, encode

@@ -1,4 +1,4 @@
-"""algorithms/targets.py against the sums of the papers, with every setting different from its neutral value."""
+"""algorithms/returns.py against the sums of the papers, with every setting different from its neutral value."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ from oracles import Stream, lambda_return, vtrace, vtrace_advantage
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
-from daedalus.algorithms.targets import lambda_targets, vtrace_corrected_targets
+from daedalus.algorithms.returns import lambda_targets, vtrace_corrected_targets
 from daedalus.protocol.spec import TrainingSpec
 
 SPEC = TrainingSpec(discount_factor=0.9, trace_lambda=0.8, rho_clip=1.25, trace_clip=0.75)

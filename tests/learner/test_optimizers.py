@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
-from daedalus.algorithms.flat_parameters import FlatParameters
+from daedalus.algorithms.forward import FlatParameters
 from daedalus.learner.training.optimizers import Adam, RmsProp
 
 

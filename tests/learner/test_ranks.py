@@ -14,10 +14,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from daedalus.algorithms.algorithm import Algorithm, Forward, Losses, MinibatchLosses
-from daedalus.algorithms.appo import Appo
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import shares_of
-from daedalus.algorithms.policy_gradient import PolicyGradient
+from daedalus.algorithms.policy_gradient import Appo, PolicyGradient
 from daedalus.learner.ranks import leader
 from daedalus.learner.ranks.parts import bounds_of, part_of
 from daedalus.learner.training.learner import Learner

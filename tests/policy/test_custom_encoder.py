@@ -16,8 +16,7 @@ from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.user_modules import UserModules
+from daedalus.policy.user_modules import NetworkError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 

@@ -17,13 +17,16 @@ from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
-from daedalus.policy.network.distributions.distribution import Distribution
-from daedalus.policy.network.distributions.gaussian import Gaussian, SquashedGaussian
-from daedalus.policy.network.distributions.kumaraswamy import Kumaraswamy
-from daedalus.policy.network.distributions.mixture import GaussianMixture
-from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.user_modules import UserModules
+from daedalus.policy.network.distributions import (
+    Categorical,
+    Distribution,
+    Gaussian,
+    GaussianMixture,
+    Kumaraswamy,
+    SquashedGaussian,
+    without_illegal,
+)
+from daedalus.policy.user_modules import NetworkError, UserModules
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
@@ -358,7 +361,7 @@ def test_bounded_distribution_refuses_unbounded_actions(name: str) -> None:
 
 OWN = """
 import torch
-from daedalus.policy.network.distributions.distribution import Distribution
+from daedalus.policy.network.distributions import Distribution
 
 
 class Own(Distribution):

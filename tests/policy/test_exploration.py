@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
-from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.noise import Noise, draw_noise, neutral_noise
 from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.distributions.categorical import Categorical
-from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.network.distributions import Categorical
+from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, ObservationSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
 

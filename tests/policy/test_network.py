@@ -14,8 +14,8 @@ from torch.nn import functional
 
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.encoders import Encoder, FlatEncoder, build_encoder
-from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.memory import Gru
+from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import PolicySpec
 

@@ -10,11 +10,10 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from daedalus.policy.acting import call_watchdog, program_check
-from daedalus.policy.acting.call_watchdog import CallWatchdog
-from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting import program_check, program_session
 from daedalus.policy.acting.noise import neutral_noise
-from daedalus.policy.acting.program_session import ProgramSession
+from daedalus.policy.acting.program_check import PolicyError
+from daedalus.policy.acting.program_session import CallWatchdog, ProgramSession
 from daedalus.policy.acting.runtime import OnnxRuntime
 
 OBSERVATIONS = np.ones((2, 2), np.float32)
@@ -202,13 +201,13 @@ def started(stop: threading.Event | None = None) -> ProgramSession:
 
 
 def test_call_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(call_watchdog, "CALL_SECONDS", 0.3)
+    monkeypatch.setattr(program_session, "CALL_SECONDS", 0.3)
     with pytest.raises(PolicyError, match="took too long"):
         started().run({SEEN: OBSERVATIONS})
 
 
 def test_stop_ends_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(call_watchdog, "STOP_SECONDS", 0.1)
+    monkeypatch.setattr(program_session, "STOP_SECONDS", 0.1)
     stop = threading.Event()
     timer = threading.Timer(0.2, stop.set)
     timer.start()
@@ -219,7 +218,7 @@ def test_stop_ends_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_calls_within_the_limit_are_not_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(call_watchdog, "CALL_SECONDS", 30.0)
+    monkeypatch.setattr(program_session, "CALL_SECONDS", 30.0)
     stop = threading.Event()
     stop.set()
     session = ProgramSession(model([COPY]).SerializeToString(), CallWatchdog(stop))
@@ -234,7 +233,7 @@ def test_time_in_which_the_process_was_frozen_does_not_count(monkeypatch: pytest
     monkeypatch.setattr(time, "monotonic", lambda: 1e9)
     watchdog.tick()
     assert not cancelled.is_set()
-    for _ in range(round(call_watchdog.CALL_SECONDS / 0.2) + 1):
+    for _ in range(round(program_session.CALL_SECONDS / 0.2) + 1):
         watchdog.tick()
     assert cancelled.is_set()
 

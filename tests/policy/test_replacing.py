@@ -1,11 +1,11 @@
-"""policy/saving/replacing.py: files that are replaced in one step."""
+"""policy/saving/regular_files.py: files that are replaced in one step."""
 
 import stat
 from pathlib import Path
 
 import pytest
 
-from daedalus.policy.saving.replacing import replace_text, replacing
+from daedalus.policy.saving.regular_files import replace_text, replacing
 
 
 def test_a_file_keeps_its_content_until_the_new_one_is_complete(tmp_path: Path) -> None:

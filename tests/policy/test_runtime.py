@@ -16,7 +16,6 @@ from plain import ACTION, NAME, act, choices
 from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 
 from daedalus.policy.acting.noise import neutral_noise
-from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import (
     LOG_PROB,
@@ -29,6 +28,7 @@ from daedalus.policy.acting.runtime import (
     action_name,
     observation_name,
     program_hash,
+    with_initializers,
 )
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.protocol.spec import PolicySpec

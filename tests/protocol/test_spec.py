@@ -252,7 +252,7 @@ def test_default_lag_bound_has_room_for_all_rollouts_in_flight(
 
 def test_every_algorithm_has_its_mathematics() -> None:
     """A record without losses, or losses without a record, would fail only when a run names it."""
-    from daedalus.algorithms.registry import CLASSES
+    from daedalus.algorithms.own_algorithm import CLASSES
 
     assert {name: algorithm.record for name, algorithm in CLASSES.items()} == ALGORITHMS
 

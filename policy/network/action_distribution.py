@@ -3,17 +3,19 @@
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.network.components import Components
-from daedalus.policy.network.custom_module import find_class
-from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
-from daedalus.policy.network.distributions.distribution import Distribution
-from daedalus.policy.network.distributions.gaussian import Gaussian, SquashedGaussian
-from daedalus.policy.network.distributions.greedy import Greedy
-from daedalus.policy.network.distributions.kumaraswamy import Kumaraswamy
-from daedalus.policy.network.distributions.mixture import GaussianMixture
-from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.network.distributions import (
+    Categorical,
+    Distribution,
+    Gaussian,
+    GaussianMixture,
+    Greedy,
+    Kumaraswamy,
+    SquashedGaussian,
+    without_illegal,
+)
+from daedalus.policy.network.layers import Components, find_class
 from daedalus.policy.user_code import first_line, place_of
-from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
+from daedalus.policy.user_modules import NO_MODULES, NetworkError, UserModuleError, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import LossSpec, PolicySpec
 
