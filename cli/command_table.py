@@ -42,7 +42,7 @@ COMMANDS = {
     "gateway": Command("commands.gateway:parser"),
     "exporter": Command("commands.exporter:parser", "commands.exporter:exporter"),
     "certs": Command("commands.certs:parser", "commands.certs:certs"),
-    "evaluate": Command("commands.evaluate_arguments:parser"),
+    "evaluate": Command("commands.evaluate:parser"),
     "plot": Command("commands.plot:parser", "commands.plot:plot"),
     "compare": Command("commands.compare:parser", "commands.compare:compare"),
     "report": Command("commands.report:parser", "commands.report:report"),

@@ -7,13 +7,13 @@ from typing import Any
 from daedalus.cli.arguments import (
     add_allow_module,
     add_insecure,
+    add_logging,
     add_processes,
     add_reset_statistics,
     add_tls,
     command_parser,
     whole_number,
 )
-from daedalus.launch.logs import add_logging
 from daedalus.launch.run_choice import (
     Choice,
     ChosenRun,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from daedalus.actor.evaluation.video import VideoError
     from daedalus.cli.comparing.recorded_run import read_metrics
     from daedalus.launch.callbacks import Callback, TrainingRun
-    from daedalus.launch.evaluate_function import EvaluationResult, evaluate
+    from daedalus.launch.evaluation import EvaluationResult, evaluate
     from daedalus.launch.train_function import RunResult, TrainingError, train
     from daedalus.learner.run.run_files import RunDataError
     from daedalus.learner.run.settings import SettingsError
@@ -54,7 +54,7 @@ _MODULES = {
     "Client": "daedalus.actor.client",
     "DamagedError": "daedalus.policy.saving.sealed",
     "EnvironmentSetupError": "daedalus.actor.environments.environment_errors",
-    "EvaluationResult": "daedalus.launch.evaluate_function",
+    "EvaluationResult": "daedalus.launch.evaluation",
     "HubError": "daedalus.policy.saving.hub",
     "NoPolicyError": "daedalus.policy.saving.saved_policy",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
@@ -64,7 +64,7 @@ _MODULES = {
     "TrainingError": "daedalus.launch.train_function",
     "TrainingRun": "daedalus.launch.callbacks",
     "VideoError": "daedalus.actor.evaluation.video",
-    "evaluate": "daedalus.launch.evaluate_function",
+    "evaluate": "daedalus.launch.evaluation",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
     "read_metrics": "daedalus.cli.comparing.recorded_run",
     "train": "daedalus.launch.train_function",

@@ -1,6 +1,5 @@
 """Configuration of logging: lines for a person, for the log of a service, or JSON objects for a log collector."""
 
-import argparse
 import json
 import logging
 import sys
@@ -13,17 +12,6 @@ from daedalus.protocol.texts import printable, utc
 
 EVENTS = "daedalus.learner.serving.events"  # logger of the events of a run
 LEVELS = ("debug", "info", "warning", "error")
-
-
-def add_logging(options: argparse._ActionsContainer) -> None:
-    """Add --log-level and --log-json."""
-    options.add_argument(
-        "--log-level",
-        choices=LEVELS,
-        default="info",
-        help="lowest severity of log records shown (default: %(default)s)",
-    )
-    options.add_argument("--log-json", action="store_true", help="write log records as JSON, one object per line")
 
 
 def configure_logging(

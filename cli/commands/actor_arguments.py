@@ -5,8 +5,7 @@ import secrets
 
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.own_name import own_name
-from daedalus.cli.arguments import add_allow_module, add_connect, add_tls, command_parser, seconds
-from daedalus.launch.logs import add_logging
+from daedalus.cli.arguments import add_allow_module, add_connect, add_logging, add_tls, command_parser, seconds
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol import keys
 from daedalus.transport.credentials import Credentials

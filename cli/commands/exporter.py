@@ -7,8 +7,8 @@ import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.launch.logs import add_logging, configure_logging, print_error
+from daedalus.cli.arguments import add_connect, add_logging, add_tls, command_parser
+from daedalus.launch.logs import configure_logging, print_error
 from daedalus.launch.process_lifecycle import status_at_start, stop_on_signals
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import RunStatus

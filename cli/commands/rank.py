@@ -6,9 +6,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from daedalus.cli.arguments import add_allow_module
+from daedalus.cli.arguments import add_allow_module, add_logging
 from daedalus.cli.ranks import follow
-from daedalus.launch.logs import add_logging, configure_logging
+from daedalus.launch.logs import configure_logging
 from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.learner.ranks.meeting import Meeting
 from daedalus.learner.training.allocator import keep_freed_memory

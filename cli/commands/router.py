@@ -4,9 +4,9 @@ import argparse
 import logging
 import math
 
-from daedalus.cli.arguments import add_insecure, add_tls, command_parser
+from daedalus.cli.arguments import add_insecure, add_logging, add_tls, command_parser
 from daedalus.cli.settings_arguments import LISTEN
-from daedalus.launch.logs import add_logging, configure_logging, print_error
+from daedalus.launch.logs import configure_logging, print_error
 from daedalus.launch.process_lifecycle import raise_descriptor_limit, status_at_start, stop_on_signals
 from daedalus.transport.addresses import check_connecting, reachable
 from daedalus.transport.connecting import listen

@@ -14,6 +14,7 @@ from typing import Any
 from daedalus.cli.arguments import (
     add_allow_module,
     add_insecure,
+    add_logging,
     add_processes,
     add_reset_statistics,
     add_tls,
@@ -41,7 +42,7 @@ from daedalus.launch.local_run import (
     resume_command,
 )
 from daedalus.launch.local_training import run_locally
-from daedalus.launch.logs import add_logging, configure_logging, print_error, say
+from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.launch.process_lifecycle import (
     UNWRITABLE,
     discard,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from processes import until
 
-from daedalus.cli.commands.evaluate_arguments import parser
+from daedalus.cli.commands.evaluate import parser
 from daedalus.cli.comparing.statistics import mean_interval
 from daedalus.launch import confirmation as module
 from daedalus.launch.child_output import ChildOutput

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from saved_runs import CARTPOLE, save, score
 
-from daedalus.cli.commands.evaluate_arguments import parser
+from daedalus.cli.commands.evaluate import parser
 from daedalus.launch import final_evaluation as module
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.final_evaluation import select_best
