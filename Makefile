@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs check format lock clean
+.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs docs-reference check format lock clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -65,8 +65,17 @@ mutants: .venv/ready-test
 	cd build/mutants && ../../$(BIN)/mutmut export-cicd-stats && ../../$(BIN)/python tests/mutants.py
 
 # The documentation site, in build/site: open index.html there.
-docs: .venv/ready-test
+docs: .venv/ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The parts of the documentation that are made from the code: a test fails while they differ.
+docs-reference: .venv/ready-train
+	$(BIN)/python docs/generate_reference.py
+
+.venv/ready-docs: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(PIP) -e ".[docs]"
+	touch $@
 
 # torch first, with its exact version: on some indexes a range would select the CUDA build.
 .venv/ready-train: pyproject.toml constraints.txt

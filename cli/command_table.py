@@ -34,6 +34,7 @@ COMMANDS = {
     "resume": Command("commands.train:resume_parser", "commands.train:resume"),
     "sweep": Command("commands.sweep:parser", "commands.sweep:sweep"),
     "check": Command("commands.check:parser", "commands.check:check"),
+    "settings": Command("commands.settings:parser", "commands.settings:settings"),
     "learner": Command("settings_arguments:learner_parser"),
     "actor": Command("commands.actor_arguments:parser"),
     "router": Command("commands.router:parser", "commands.router:router"),

@@ -17,6 +17,7 @@ on this machine:
   resume     continue a run from its newest checkpoint
   sweep      train runs of several settings and seeds, and compare them
   check      play an environment with random actions, and report its faults, its speed and what train would choose
+  settings   print the settings of a run with their defaults, limits and meanings
 
 on several machines, one process at a time:
   learner    own the weights, and train them on the rollouts of actors

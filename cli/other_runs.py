@@ -3,7 +3,7 @@
 import logging
 from pathlib import Path
 
-from daedalus.gateway.watching.source import OtherRun
+from daedalus.gateway.watching.page_data import OtherRun
 from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.run.run_directory import METRICS
 from daedalus.learner.serving.metrics_history import MetricsHistory

@@ -3,20 +3,44 @@
 import asyncio
 import importlib.resources
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
-from daedalus.gateway.assets import Asset, read_assets
 from daedalus.gateway.connection import ClientConnection
 from daedalus.gateway.gateway import MAX_CLIENTS, Gateway
 from daedalus.gateway.places import Places, most_connections
 from daedalus.gateway.security import HEADERS, Guard
 from daedalus.gateway.watching.page_data import PageData
 from daedalus.gateway.watching.viewer import ViewerConnection
+
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+
+
+class Asset(NamedTuple):
+    """One file."""
+
+    content: bytes
+    media_type: str
+
+
+def read_assets() -> dict[str, Asset]:
+    """Return the files of gateway/page by name."""
+    found = {}
+    for entry in importlib.resources.files("daedalus.gateway").joinpath("page").iterdir():
+        media_type = _TYPES.get("." + entry.name.rpartition(".")[2])
+        if media_type is not None:
+            found[entry.name] = Asset(entry.read_bytes(), media_type)
+    return found
+
 
 _NO_CLIENTS = "this gateway serves its page only: start the run with --clients too, or a gateway of its own\n"
 

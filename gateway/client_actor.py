@@ -13,11 +13,9 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.errors import ActorError
-from daedalus.gateway.client_images import check_images
-from daedalus.gateway.client_spaces import ClientSpaces
+from daedalus.gateway.client_messages import Act, ClientError, EndEpisode
+from daedalus.gateway.client_spaces import ClientSpaces, check_images
 from daedalus.gateway.client_uploads import ClientUploads
-from daedalus.gateway.errors import ClientError
-from daedalus.gateway.messages import Act, EndEpisode
 from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice

@@ -4,6 +4,7 @@ Spaces are those of protocol/spaces.py: maps of named components. A value is a m
 whose only component is named `observation`, and an action whose only one is named `action`, are bare values.
 """
 
+import contextlib
 import itertools
 import math
 from array import array
@@ -15,7 +16,9 @@ import numpy as np
 from gymnasium import spaces as gym
 from pydantic import ValidationError
 
-from daedalus.gateway.errors import ClientError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.pixels import Pixels
+from daedalus.gateway.client_messages import ClientError
 from daedalus.protocol.spaces import (
     LARGEST_OBSERVATION,
     ArraySpace,
@@ -24,6 +27,7 @@ from daedalus.protocol.spaces import (
     Spaces,
     unfit_number,
 )
+from daedalus.protocol.spec import EnvironmentSpec
 
 _NUMBER_BYTES, _INTEGER_BYTES, _FLAG_BYTES = 32, 8, 8  # of one value in JSON, with a comma and some indentation
 _NAME_BYTES, _MESSAGE_BYTES = 128, 4096  # of one component's name, and of everything else in a message
@@ -269,3 +273,30 @@ def _plain(value: Any, space: DiscreteSpace | ContinuousSpace) -> Any:
     if isinstance(space, DiscreteSpace) and space.size == 1:
         return int(value)
     return np.asarray(value).reshape(-1).tolist()
+
+
+MAX_IMAGE_BYTES = 8 << 20  # 1920 x 1080 pixels in RGB fit
+MAX_SIDE = 8192  # pixels
+
+
+def check_images(spaces: Spaces, spec: EnvironmentSpec) -> None:
+    """Raise ClientError if an image of a client is too large for the pixel transforms of the run.
+
+    Call it for spaces that the transforms fit: images that they do not fit are not transformed.
+    """
+    if spec.crop is None and not spec.grey and spec.resize is None:
+        return
+    for name, space in spaces.observations.items():
+        if isinstance(space, ArraySpace) and space.dtype == "uint8" and name not in spec.leave_out:
+            with contextlib.suppress(EnvironmentSetupError):
+                _check_image(name, space, spec)
+
+
+def _check_image(name: str, space: ArraySpace, spec: EnvironmentSpec) -> None:
+    size = Pixels(spec, UniformBox(0, 255, space.shape, np.uint8)).largest_bytes
+    if size > MAX_IMAGE_BYTES or max(space.shape) > MAX_SIDE:
+        raise ClientError(
+            "refused",
+            f"{name} is an image of shape {space.shape}, for which the transforms of the run need {size:,} bytes: send "
+            f"images of at most {MAX_SIDE:,} pixels a side that need at most {MAX_IMAGE_BYTES:,} bytes",
+        )

@@ -1,15 +1,23 @@
-"""The full rollouts of one client on their way to the learner. For the gateway's event loop; never waits."""
+"""The full rollouts of clients on their way to the learner, sent on a thread of its own.
 
+The event loop never waits. Zenoh makes a sender wait while the link is congested.
+"""
+
+import asyncio
+import contextlib
+import queue
+import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 from daedalus.actor.session.client_reports import ClientReports
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Join, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
-from daedalus.transport.interface import QuerySender
+from daedalus.transport.interface import OnAnswer, QuerySender, Transport, TransportError
 
 _MAX_FULL_ROLLOUTS = 8  # that wait for room in the window; beyond that the oldest is dropped
 
@@ -97,3 +105,96 @@ class ClientUploads:
     def ended_by(self) -> tuple[str, str]:
         """The verdict that ended the session, and the reason; both empty while it goes on."""
         return self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
+
+
+class Outbox:
+    """The clients that have a rollout to send.
+
+    Encoding takes longer than the choice of an action, and clients that began together fill their rollouts together. So
+    each turn of the event loop encodes one rollout for the sender (sender.py), and answers clients between them.
+    """
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._ready: dict[ClientUploads, None] = {}  # in the order in which they are sent
+
+    def add(self, uploads: ClientUploads) -> None:
+        """Send the rollouts of a client, soon."""
+        if not self._ready:
+            self._loop.call_soon(self._send_one)
+        self._ready[uploads] = None
+
+    def _send_one(self) -> None:
+        uploads = next(iter(self._ready))
+        del self._ready[uploads]
+        uploads.send_one()
+        if uploads.can_send:
+            self._ready[uploads] = None
+        if self._ready:
+            self._loop.call_soon(self._send_one)
+
+
+_MAX_QUERIES = 1 << 17  # that wait for the thread: the windows of 2,048 clients, with 64 rollouts each
+_POLL_SECONDS = 0.2  # how soon the thread notices `close` if the queue was full
+
+
+class _Query(NamedTuple):
+    """Arguments of one `query_async`."""
+
+    key: str
+    payload: bytes
+    timeout: float
+    on_answer: OnAnswer
+
+
+class Sender:
+    """A QuerySender: a queue of queries, which the thread sends in the order of the calls."""
+
+    def __init__(self, transport: Transport, on_failure: Callable[[Exception], None]) -> None:
+        """Construct the sender.
+
+        Args:
+          transport: the network; the caller closes it, after the sender.
+          on_failure: called on the thread with an error of ours, which ends it.
+        """
+        self._transport, self._on_failure = transport, on_failure
+        self._queue: queue.Queue[_Query | None] = queue.Queue(_MAX_QUERIES)
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
+
+    def open(self) -> None:
+        """Begin to send."""
+        self._thread.start()
+
+    def close(self, timeout: float) -> None:
+        """Send what waits, for at most `timeout` seconds, and refuse further queries. Idempotent."""
+        self._closed.set()
+        with contextlib.suppress(queue.Full):
+            self._queue.put_nowait(None)  # wakes the thread
+        if self._thread.is_alive():
+            self._thread.join(timeout)
+
+    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
+        """See QuerySender. `timeout` begins when the thread sends the query."""
+        if self._closed.is_set():
+            raise TransportError("the gateway stops")
+        try:
+            self._queue.put_nowait(_Query(key, payload, timeout, on_answer))
+        except queue.Full:
+            raise TransportError(f"{_MAX_QUERIES:,} queries wait for the link already: try again later") from None
+
+    def _run(self) -> None:
+        try:
+            while not (self._closed.is_set() and self._queue.empty()):
+                with contextlib.suppress(queue.Empty):
+                    self._send(self._queue.get(timeout=_POLL_SECONDS))
+        except Exception as error:  # broad: any error of ours ends the gateway
+            self._on_failure(error)
+
+    def _send(self, query: _Query | None) -> None:
+        if query is None:
+            return
+        try:
+            self._transport.query_async(query.key, query.payload, timeout=query.timeout, on_answer=query.on_answer)
+        except TransportError:
+            query.on_answer(None)

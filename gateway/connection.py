@@ -7,15 +7,13 @@ import time
 from collections import deque
 from typing import Any
 
-from daedalus.gateway import messages
+from daedalus.gateway import client_messages
 from daedalus.gateway.channel import channel_of
 from daedalus.gateway.client_actor import ClientActor
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.client_messages import TRANSITIONS, Act, ClientError, EndEpisode, Hello, Reward, State
 from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
-from daedalus.gateway.messages import TRANSITIONS, Act, EndEpisode, Hello, Reward, State
 from daedalus.gateway.places import Places
-from daedalus.gateway.rate_limit import RateLimit
-from daedalus.gateway.security import Guard
+from daedalus.gateway.security import Guard, RateLimit
 
 _logger = logging.getLogger(__name__)
 
@@ -82,7 +80,7 @@ class ClientConnection:
             return
         text = event.get("text")
         self._as_text = text is not None
-        hello = messages.read(event["bytes"] if text is None else text, self._state)
+        hello = client_messages.read(event["bytes"] if text is None else text, self._state)
         assert isinstance(hello, Hello)
         owner = self._guard.check_token(hello.name, hello.token) or self._channel.peer
         with self._places.take(owner, self.end):
@@ -101,7 +99,7 @@ class ClientConnection:
             self._channel.limit(actor.spaces.max_message_bytes)
             session = gateway.run.session
             if session is not None:
-                self._write(messages.welcome(session.run, session.spec.environment.id, hello.name))
+                self._write(client_messages.welcome(session.run, session.spec.environment.id, hello.name))
             _logger.info("client %s connected from %s", actor.name, address)
             self._state, self._seat = "ready", (gateway, actor)
             self._channel.divert(self._on_message, self._go_on)
@@ -164,7 +162,7 @@ class ClientConnection:
 
     def _answer(self, gateway: Gateway, actor: ClientActor, data: str | bytes) -> None:
         try:
-            match message := messages.read(data, self._state):
+            match message := client_messages.read(data, self._state):
                 case Act():
                     gateway.act(actor, message, self._on_action)
                     self._is_waiting = True
@@ -178,24 +176,24 @@ class ClientConnection:
             if self._faults == _MAX_FAULTS:
                 self.end(error)
             else:
-                self._write(messages.error(error))
+                self._write(client_messages.error(error))
 
     def _on_action(self, action: Any) -> None:
         self._is_waiting, self._state = False, TRANSITIONS[self._state, "act"]
-        self._write(messages.action(action))
+        self._write(client_messages.action(action))
         if self._unanswered:
             self._go_on()
 
     def _write(self, message: dict[str, Any]) -> None:
-        self._channel.write(messages.encode(message, as_text=self._as_text))
+        self._channel.write(client_messages.encode(message, as_text=self._as_text))
 
     async def _finish(self, reason: ClientError | str) -> None:
         """Say why the connection ends, and close it."""
         self._channel.settle(False)
         if isinstance(reason, str):
-            message, code = messages.run_ended(reason), _OK
+            message, code = client_messages.run_ended(reason), _OK
         else:
-            message, code = messages.error(reason), _TRY_LATER if reason.code == "unavailable" else _FAULT
+            message, code = client_messages.error(reason), _TRY_LATER if reason.code == "unavailable" else _FAULT
         with contextlib.suppress(TimeoutError, OSError):  # OSError: the client is gone
             async with asyncio.timeout(_SEND_SECONDS):
                 self._write(message)

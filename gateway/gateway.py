@@ -1,37 +1,99 @@
 """The clients of a gateway as actors of a run. For the gateway's event loop; what may wait has threads of its own.
 
-event loop        clients' messages, actions, rollouts: this file, connection.py, batcher.py, outbox.py
+event loop        clients' messages, actions, rollouts: this file, connection.py, batcher.py, client_uploads.py
 link thread       finds the learner, loads snapshots: learner_link.py
 join threads      requests to join, which may wait: joining.py
 presence thread   declares which clients are present: presence.py
-sender thread     sends the rollouts: sender.py
+sender thread     sends the rollouts: client_uploads.py
 """
 
 import asyncio
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from daedalus.actor.session.origin import own_origin
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.client_messages import Act, ClientError, Hello
 from daedalus.gateway.client_spaces import ClientSpaces
-from daedalus.gateway.client_uploads import ClientUploads
-from daedalus.gateway.config import GatewayConfig
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.client_uploads import ClientUploads, Outbox, Sender
 from daedalus.gateway.followed_run import FollowedRun
 from daedalus.gateway.joining import Joining, Seat
 from daedalus.gateway.learner_link import LearnerLink, NewestPolicy
-from daedalus.gateway.messages import Act, Hello
-from daedalus.gateway.outbox import Outbox
-from daedalus.gateway.parked_actors import ParkedActors
 from daedalus.gateway.policy_versions import PolicyVersion, PolicyVersions
-from daedalus.gateway.sender import Sender
+from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Origin, Welcome
 from daedalus.transport.interface import Transport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatewayConfig:
+    """What a gateway decides for itself."""
+
+    name: str  # of its own requests; it is no actor
+    owner: str = ""  # the name in its certificate: clients are OWNER.NAME to the learner; empty without a certificate
+    run: str = keys.ANY_RUN
+
+    def actor_name(self, client: str) -> str:
+        """Return the name of a client towards the learner. Raises ClientError if there is none."""
+        name = f"{self.owner}.{client}" if self.owner else client
+        if not keys.is_name(client) or not keys.is_name(name):
+            raise ClientError(
+                "malformed",
+                f"name must be 1 to {64 - len(name) + len(client)} letters, digits, '.', '_' or '-', starting with a "
+                "letter or digit",
+            )
+        return name
+
+
+_SECONDS = 60.0  # for which a client may return
+
+
+class ParkedActors:
+    """Up to a number of actors; the one that has been absent longest goes first."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._actors: dict[str, tuple[float, ClientActor]] = {}  # by name, the oldest first
+
+    def __iter__(self) -> Iterator[ClientActor]:
+        return (actor for _, actor in self._actors.values())
+
+    def park(self, actor: ClientActor) -> None:
+        """Keep an actor whose client has disconnected."""
+        self._actors[actor.name] = time.monotonic(), actor
+        if len(self._actors) > self._most:
+            self.release_oldest()
+
+    def take(self, name: str, spaces: ClientSpaces) -> ClientActor | None:
+        """Return the actor of a client that returns with the same spaces."""
+        _, actor = self._actors.pop(name, (0.0, None))
+        if actor is not None and actor.spaces.stated != spaces.stated:
+            actor.release()
+            return None
+        return actor
+
+    def release_oldest(self) -> None:
+        """Release the actor that has been absent longest, if there is one."""
+        if self._actors:
+            _, actor = self._actors.pop(next(iter(self._actors)))
+            actor.release()
+
+    def release_late(self, now: float) -> None:
+        """Release those that did not return in time."""
+        while self._actors and now > next(iter(self._actors.values()))[0] + _SECONDS:
+            self.release_oldest()
+
+    def clear(self) -> None:
+        """Release all."""
+        while self._actors:
+            self.release_oldest()
+
 
 MAX_CLIENTS = 1024
 JOIN_SECONDS = 60.0  # for a learner and its first policy to come

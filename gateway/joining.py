@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from daedalus.actor.errors import ActorError, NameInUseError
 from daedalus.actor.session.run_end import RunOverError
 from daedalus.gateway.client_actor import ClientActor
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.followed_run import FollowedRun
 from daedalus.gateway.learner_link import LearnerLink
 from daedalus.gateway.presence import Presence

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.client_messages import ClientError
 
 _MAX_CONNECTIONS = 2048
 _OTHER_DESCRIPTORS = 256  # that are no connections of clients

@@ -24,7 +24,7 @@ from websockets.frames import CloseCode, Frame
 from websockets.http11 import Request as HandshakeRequest
 
 from daedalus.gateway.app import Application
-from daedalus.gateway.messages import MAX_HELLO_BYTES
+from daedalus.gateway.client_messages import MAX_HELLO_BYTES
 from daedalus.gateway.places import most_connections, network_of, peer_of
 from daedalus.transport.credentials import CERTIFICATE, KEY
 

@@ -14,18 +14,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from daedalus.gateway.app import application
-from daedalus.gateway.config import GatewayConfig
-from daedalus.gateway.errors import ClientError
-from daedalus.gateway.gateway import Gateway
-from daedalus.gateway.security import LOOPBACK, guard
+from daedalus.gateway.client_messages import ClientError
+from daedalus.gateway.gateway import Gateway, GatewayConfig
+from daedalus.gateway.security import LOOPBACK, OperatorToken, Tokens, guard
 from daedalus.gateway.server import Server, tls_context
-from daedalus.gateway.tokens import OperatorToken, Tokens
 from daedalus.gateway.watching.camera import CameraProcess
 from daedalus.gateway.watching.learner_source import LearnerSource
 from daedalus.gateway.watching.monitor import RunMonitor
-from daedalus.gateway.watching.observation import Observation
-from daedalus.gateway.watching.page_data import PageData
-from daedalus.gateway.watching.source import OtherRun
+from daedalus.gateway.watching.page_data import Observation, OtherRun, PageData
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import Order
 from daedalus.transport.connecting import connect_with_retry

@@ -30,7 +30,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from daedalus.gateway.tokens import OPERATOR, TOKENS, digest, new_token
+from daedalus.gateway.security import OPERATOR, TOKENS, digest, new_token
 from daedalus.policy.saving.regular_files import replace_text, replacing
 from daedalus.protocol import keys
 from daedalus.transport.access_control import common_name

@@ -10,11 +10,17 @@ from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import Credentials
 
 
-def make_certificates(directory: Path) -> Path:
-    """Create a CA and certificates with `daedalus certs`, with the actors arm and box; return the folder."""
+def make_certificates(directory: Path, *issued: str) -> Path:
+    """Create a CA with `daedalus certs`, and issue certificates, of the actors arm and box by default."""
     assert certs(["init", str(directory)]) == 0
-    assert certs(["issue", "actor", "arm", "box", "--directory", str(directory)]) == 0
+    for words in issued or ("actor arm box",):
+        change_certificates(directory, f"issue {words}")
     return directory
+
+
+def change_certificates(directory: Path, words: str) -> None:
+    """Run `daedalus certs WORDS` in a folder."""
+    assert certs([*words.split(), "--directory", str(directory)]) == 0
 
 
 def issue_expired(directory: Path, role: str, name: str = "") -> Path:

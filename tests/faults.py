@@ -198,11 +198,6 @@ class Sender:
         )
         return encode(Rollout(identity=identity, policy_version=version, **{**content, **changed}))
 
-    def poison(self, sequence: int, version: int) -> bytes:
-        """Return an encoded rollout whose rewards are nan."""
-        shape = (self.welcome.spec.collection.rollout_length, self.environments)
-        return self.rollout(sequence, version, rewards=np.full(shape, np.nan, np.float32))
-
     def send(self, payload: bytes) -> Acknowledgement:
         """Send bytes as a rollout and return the answer of the learner."""
         (answer,) = self.transport.query(self.key, payload, timeout=ANSWER_SECONDS)

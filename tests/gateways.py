@@ -14,11 +14,9 @@ from processes import LIMIT
 from websockets.sync.client import ClientConnection, connect
 
 from daedalus.gateway.app import application
-from daedalus.gateway.config import GatewayConfig
-from daedalus.gateway.gateway import Gateway
-from daedalus.gateway.security import LOOPBACK, guard
+from daedalus.gateway.gateway import Gateway, GatewayConfig
+from daedalus.gateway.security import LOOPBACK, OperatorToken, Tokens, guard
 from daedalus.gateway.server import Server, tls_context
-from daedalus.gateway.tokens import OperatorToken, Tokens
 from daedalus.gateway.watching.page_data import PageData
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

@@ -81,8 +81,8 @@ def starting(folder: Path) -> Iterator[Callable[..., Running]]:
     """Give a function that starts `daedalus ARGUMENTS` in the folder. Processes left are killed at the end."""
     running: list[Running] = []
 
-    def start(*arguments: object, directory: Path = folder) -> Running:
-        running.append(Running(DAEDALUS + [str(argument) for argument in arguments], directory))
+    def start(*arguments: object, directory: Path = folder, command: list[str] = DAEDALUS) -> Running:
+        running.append(Running(command + [str(argument) for argument in arguments], directory))
         return running[-1]
 
     try:

@@ -70,6 +70,7 @@ class ScriptedLearner:
         self.reports: queue.Queue[ClientReport] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
+        self.newer: tuple[str, ...] = ()  # settings that the run changes and this release does not know
         self.epsilons: dict[str, float] = {}  # by actor; 0 of the others
         self.extras: dict[str, np.ndarray] = {}  # in snapshots, besides the weights
         self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
@@ -87,9 +88,9 @@ class ScriptedLearner:
         assert isinstance(message, Join)
         self.joins.put(message)
         epsilon = self.epsilons.get(message.actor, 0.0)
-        answer: Message = Welcome(
-            run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=self.spec.for_actors()
-        )
+        spec = self.spec.for_actors()
+        spec = spec.model_copy(update={"changed": spec.changed + self.newer})
+        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=spec)
         request.reply(encode(self.refusal or answer))
 
     def _report(self, request: Request) -> None:

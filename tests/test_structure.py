@@ -117,7 +117,7 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("certificates.py", "datetime.datetime.now"),  # certificates are valid between two dates
         ("credentials.py", "time.time"),
         ("credentials.py", "time.strftime"),
-        ("tokens.py", "time.time"),  # tokens of clients expire on a date
+        ("security.py", "time.time"),  # tokens of clients expire on a date
         ("certificates.py", "time.time"),
     }
 

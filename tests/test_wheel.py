@@ -1,33 +1,19 @@
 """Test of wheel and sdist: their files, and use beside packages and scripts of the same names."""
 
-import os
 import shutil
-import subprocess
-import sys
-import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path
 
 import pytest
+from installing import build, installed, run
 
 from daedalus.learner.run.settings import preset_names
 
 ROOT = Path(__file__).parent.parent
 FILES = ("LICENSE", "MANIFEST.in", "README.md", "pyproject.toml")
-BUILD = "import sys, setuptools.build_meta as backend; getattr(backend, sys.argv[1])(sys.argv[2])"
 SCRIPTS = ("actor", "cli", "gateway", "launch", "learner", "policy", "protocol", "transport")
 RAISES = "raise ImportError('this is not the package that Daedalus means')\n"
-
-
-def run(*words: str | Path, folder: Path) -> str:
-    """Run a command without this repository on the path and return its output."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    result = subprocess.run(
-        words, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
-    )
-    assert result.returncode == 0, result.stdout
-    return result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -45,35 +31,17 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sdist(tree: Path) -> Path:
-    target = tree.parent / "sdist"
-    run(sys.executable, "-c", BUILD, "build_sdist", target, folder=tree)
-    (archive,) = target.iterdir()
-    return archive
+    return build("sdist", tree, tree.parent / "sdist")
 
 
 @pytest.fixture(scope="module")
 def wheel(sdist: Path) -> Path:
     """Build the wheel from the unpacked sdist, as an installer does if there is no wheel."""
-    unpacked, target = sdist.parent.parent / "unpacked", sdist.parent.parent / "wheel"
+    unpacked = sdist.parent.parent / "unpacked"
     with tarfile.open(sdist) as archive:
         archive.extractall(unpacked, filter="data")
     (folder,) = unpacked.iterdir()
-    target.mkdir()
-    run(sys.executable, "-c", BUILD, "build_wheel", target, folder=folder)
-    (built,) = target.iterdir()
-    return built
-
-
-def installed(environment: Path, *packages_to_install: str | Path) -> Path:
-    """Create an environment with the packages of this one but without this repository; return its site-packages."""
-    run(sys.executable, "-m", "venv", "--without-pip", environment, folder=environment.parent)
-    pip = [sys.executable, "-m", "pip", "--python", environment / "bin" / "python"]
-    options = ["--quiet", "--no-deps", "--no-index", "--no-build-isolation"]
-    (packages,) = environment.glob("lib/python*/site-packages")
-    # Lines of a .pth file are added to the path; .pth files in the folders that they name are not read.
-    (packages / "beside.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    run(*pip, "install", *options, *packages_to_install, folder=environment.parent)
-    return packages
+    return build("wheel", folder, sdist.parent.parent / "wheel")
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from daedalus.actor.errors import ActorError
 from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_logging, add_tls, command_parser
 from daedalus.cli.gateway_packages import INSTALL
 from daedalus.cli.other_runs import OtherRuns
-from daedalus.gateway.tokens import OperatorToken
+from daedalus.gateway.security import OperatorToken
 from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.launch.process_lifecycle import (
     BAD_USAGE,

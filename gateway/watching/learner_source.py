@@ -22,7 +22,7 @@ _ANSWER_SECONDS = 5.0
 
 
 class LearnerSource:
-    """A RunSource over a transport (gateway/watching/source.py)."""
+    """A RunSource over a transport (gateway/watching/page_data.py)."""
 
     def __init__(self, transport: Transport, run: str = keys.ANY_RUN, chosen: Callable[[], str] = lambda: "") -> None:
         """Construct the source.

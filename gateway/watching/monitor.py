@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from daedalus.gateway.watching.observation import Observation
-from daedalus.gateway.watching.source import RunSource
+from daedalus.gateway.watching.page_data import Observation, RunSource
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.interface import TransportError

@@ -5,17 +5,74 @@ import contextlib
 import json
 import logging
 import time
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from daedalus.gateway.channel import channel_of
-from daedalus.gateway.errors import ClientError
-from daedalus.gateway.rate_limit import RateLimit
-from daedalus.gateway.security import Guard
-from daedalus.gateway.tokens import OPERATOR
-from daedalus.gateway.watching import observation, viewer_messages
-from daedalus.gateway.watching.observation import Observation
-from daedalus.gateway.watching.page_data import PageData
-from daedalus.gateway.watching.viewer_messages import ViewerCamera, ViewerHello, ViewerOrder
+from daedalus.gateway.client_messages import ClientError
+from daedalus.gateway.security import OPERATOR, Guard, RateLimit
+from daedalus.gateway.watching import page_data
+from daedalus.gateway.watching.page_data import Observation, PageData
+from daedalus.protocol.messages import Order
+
+MAX_BYTES = 4096
+
+
+class ViewerHello(NamedTuple):
+    """The first message of a page."""
+
+    token: str
+
+
+class ViewerOrder(NamedTuple):
+    """An order to the learner."""
+
+    order: Order
+    token: str  # of an operator
+
+
+class ViewerCamera(NamedTuple):
+    """Whether the page shows the camera."""
+
+    on: bool
+
+
+ViewerMessage = ViewerHello | ViewerOrder | ViewerCamera
+_FIELDS: dict[str, set[str]] = {
+    "hello": {"type", "token"},
+    "order": {"type", "order", "token"},
+    "camera": {"type", "on"},
+}
+
+
+def read_message(data: str | bytes | None) -> ViewerMessage:
+    """Return a message of a page. Raises ClientError if it is malformed."""
+    message = _decoded(data)
+    kind = message.get("type")
+    if not isinstance(kind, str) or message.keys() != _FIELDS.get(kind):
+        raise ClientError("malformed", "the message is none that a page sends")
+    match message:
+        case {"type": "hello", "token": str(token)}:
+            return ViewerHello(token)
+        case {"type": "order", "order": "stop" | "checkpoint" as order, "token": str(token)}:
+            chosen: Literal["stop", "checkpoint"] = order
+            return ViewerOrder(chosen, token)
+        case {"type": "camera", "on": bool(on)}:
+            return ViewerCamera(on)
+        case _:
+            raise ClientError("malformed", f"{kind} has a field of a wrong type")
+
+
+def _decoded(data: str | bytes | None) -> dict[str, Any]:
+    if not isinstance(data, str) or len(data) > MAX_BYTES:
+        raise ClientError("malformed", f"a message must be JSON of at most {MAX_BYTES} bytes")
+    try:
+        message = json.loads(data)
+    except (ValueError, RecursionError):
+        raise ClientError("malformed", "the message is not JSON") from None
+    if not isinstance(message, dict):
+        raise ClientError("malformed", "the message is not a map")
+    return message
+
 
 _logger = logging.getLogger(__name__)
 
@@ -42,7 +99,7 @@ class ViewerConnection:
         """Serve the page until it is closed."""
         self._task = asyncio.current_task()
         await self._receive()  # the request to connect
-        self._channel.limit(viewer_messages.MAX_BYTES)
+        self._channel.limit(MAX_BYTES)
         await self._send_event({"type": "websocket.accept"})
         try:
             owner = await self._greet()
@@ -100,7 +157,7 @@ class ViewerConnection:
         with contextlib.suppress(OSError):  # the page is closed
             others = await asyncio.to_thread(self._data.other_runs)
             await self._send_texts(
-                [{"type": "comparison", "name": run.name, **observation.table(run.rows)} for run in others]
+                [{"type": "comparison", "name": run.name, **page_data.table(run.rows)} for run in others]
             )
             while True:
                 news = self._data.news
@@ -111,16 +168,16 @@ class ViewerConnection:
 
     def _changes(self, seen: Observation) -> list[dict[str, Any]]:
         """Return the messages about what differs from what was sent; all at first, in place of what the page had."""
-        sent, messages = self._sent, [observation.run_message(seen)]
+        sent, messages = self._sent, [page_data.run_message(seen)]
         if sent is None or seen.actors is not sent.actors:
-            messages.append(observation.actors_message(seen.actors))
+            messages.append(page_data.actors_message(seen.actors))
         if sent is None or seen.events is not sent.events:
-            messages.append(observation.events_message(seen.events))
+            messages.append(page_data.events_message(seen.events))
         if sent is None or sent.generation != seen.generation:
-            messages.append(observation.metrics_message(seen, False, 0))
+            messages.append(page_data.metrics_message(seen, False, 0))
         elif seen.rows is not sent.rows:
             first = sent.rows[-1][0] + 1 if sent.rows else 0
-            messages.append(observation.metrics_message(seen, True, first))
+            messages.append(page_data.metrics_message(seen, True, first))
         return messages
 
     async def _send_texts(self, messages: list[dict[str, Any]]) -> None:
@@ -150,12 +207,12 @@ class ViewerConnection:
 
     # ----------------------------------------------------------------------------------------- from the page
 
-    async def _next(self) -> viewer_messages.ViewerMessage:
+    async def _next(self) -> ViewerMessage:
         """Return the next message. Raises EOFError if the page is closed, ClientError if the message is malformed."""
         event = await self._receive()
         if event["type"] == "websocket.disconnect":
             raise EOFError
-        return viewer_messages.read(event.get("text"))
+        return read_message(event.get("text"))
 
     async def _obey(self) -> None:
         faults = 0
@@ -171,7 +228,7 @@ class ViewerConnection:
                     raise
                 await self._send({"type": "refused", "reason": error.reason})
 
-    async def _answer(self, message: viewer_messages.ViewerMessage) -> None:
+    async def _answer(self, message: ViewerMessage) -> None:
         match message:
             case ViewerOrder():
                 self._guard.check_operator(message.token)

@@ -130,6 +130,16 @@ def test_failure_of_an_actor_is_reported_to_its_learner(network: MemoryNetwork) 
     assert failed.origin.software.startswith("daedalus-rl ")
 
 
+def test_run_that_uses_a_setting_of_a_newer_release_is_refused_and_the_learner_notified(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    learner.newer = ("environment.newer",)
+    actor = RunningActor(network)
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert str(actor.error).startswith("the run sets environment.newer, which this release does not know: upgrade")
+    assert [join.failure for join in learner.joins.queue] == ["", str(actor.error)]
+
+
 def test_unexpected_error_is_reported_with_its_type(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a fault of a simulator")

@@ -1,9 +1,7 @@
 """The documentation as text, for the tests that check what it says against the code."""
 
-import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -23,20 +21,11 @@ def name_of(page: Path) -> str:
 
 def code_blocks(text: str, language: str = "") -> list[str]:
     """Return the contents of the fenced blocks of one language, or of those without one."""
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    return [block for found, block in blocks if found == language]
 
 
 def inline_code(text: str) -> list[str]:
     """Return what stands in single backticks, line breaks as spaces."""
     prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     return [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
-
-
-def hook(name: str) -> ModuleType:
-    """Return a module of docs/hooks, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, DOCS / "hooks" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

@@ -10,7 +10,7 @@ import pytest
 from pages import PAGES, ROOT, code_blocks, inline_code, name_of
 
 from daedalus.cli.command_table import COMMANDS
-from daedalus.cli.commands import actor_arguments, evaluate_arguments
+from daedalus.cli.commands import actor_arguments, evaluate
 from daedalus.cli.settings_arguments import resolve
 from daedalus.learner.run.settings import SettingsError
 from daedalus.transport.addresses import AddressError, check_listening
@@ -18,13 +18,21 @@ from daedalus.transport.addresses import AddressError, check_listening
 
 def commands_in_blocks(text: str) -> list[list[str]]:
     """Return the words after `daedalus` of each command line in a page's blocks."""
-    lines = [re.sub(r"\s#\s.*", "", line) for block in code_blocks(text) for line in block.splitlines()]
+    blocks = [block.replace("\\\n", " ") for block in code_blocks(text)]
+    lines = [re.sub(r"\s#\s.*", "", line) for block in blocks for line in block.splitlines()]
+    lines += [line for block in code_blocks(text, "text") for line in examples_of(block)]
     return [
         shlex.split(command)
         for line in lines
-        for part in re.split(r"&&|\s>\s", line)
+        for part in re.split(r"&&|\|\||\s>\s", line)
         for command in re.findall(r"(?<![`\w./'-])daedalus (?=[a-z])(.*)", part)
     ]
+
+
+def examples_of(help_text: str) -> list[str]:
+    """Return the command lines in the examples of a command's help, without the remarks behind them."""
+    lines = [line.strip() for line in help_text.splitlines() if line.startswith("  daedalus ")]
+    return [re.sub(r"\s{2,}.*", "", line) for line in lines]
 
 
 def commands_in_sentences(text: str) -> list[list[str]]:
@@ -65,7 +73,7 @@ def check(words: Sequence[str], *, whole: bool = True) -> None:
         if command == "actor" and whole:
             actor_arguments.config(parsed, None)
         if command == "evaluate" and whole and not parsed.render:
-            evaluate_arguments.check(parsed)
+            evaluate.evaluation_options(parsed)
     except (SettingsError, AddressError, ValueError) as error:
         pytest.fail(f"`daedalus {' '.join(words)}` is refused: {error}")
     except SystemExit as end:

@@ -1,42 +1,33 @@
-"""The references of settings and commands, which are generated from the code."""
+"""The references of settings, commands and the Python API, whose generated parts are in the repository."""
 
 import re
+import subprocess
+import sys
 
 import pytest
-from pages import DOCS, hook
-from pydantic import BaseModel
+from pages import DOCS, ROOT
 
 from daedalus.cli.command_table import COMMANDS
+from daedalus.cli.commands.settings import Setting, all_settings
 from daedalus.cli.main import USAGE
 from daedalus.learner.reporting.metrics import GROUPS
-from daedalus.protocol.models import meanings
-from daedalus.protocol.spec import RunSpec
 
-SETTINGS = hook("settings_reference").settings_tables().splitlines()
-REFERENCE = hook("command_reference")
+SETTINGS = {setting.path: setting for setting in all_settings()}
 
 
-def sections() -> dict[str, type[BaseModel]]:
-    return {
-        name: field.annotation
-        for name, field in RunSpec.model_fields.items()
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
-    }
+def test_the_generated_parts_of_the_references_are_those_of_the_code() -> None:
+    command = [sys.executable, str(DOCS / "generate_reference.py"), "--check"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
-FIELDS = [(section, key) for section, model in sections().items() for key in model.model_fields]
-
-
-@pytest.mark.parametrize(("section", "key"), FIELDS)
-def test_every_setting_has_a_meaning_and_a_row(section: str, key: str) -> None:
-    assert re.fullmatch(r"[^a-z].*[.]", meanings(sections()[section])[key])
-    rows = [row for row in SETTINGS if row.startswith(f"| `{section}.{key}` |")]
-    assert len(rows) == 1
-    assert rows[0].count("|") - rows[0].count("\\|") == 6
+@pytest.mark.parametrize("setting", SETTINGS.values(), ids=SETTINGS)
+def test_every_setting_has_a_meaning(setting: Setting) -> None:
+    assert re.fullmatch(r"[^a-z].*[.]", setting.meaning)
 
 
 @pytest.mark.parametrize(
-    ("setting", "kind", "limits", "default"),
+    ("name", "kind", "limits", "default"),
     [
         ("training.learning_rate", "float", "> 0, ≤ 1", "`0.001`"),
         ("training.max_policy_lag", "int", "≥ 0", "unset"),
@@ -48,9 +39,9 @@ def test_every_setting_has_a_meaning_and_a_row(section: str, key: str) -> None:
         ("training.stop_when_solved", "bool", "", "`true`"),
     ],
 )
-def test_rows_state_type_range_and_default(setting: str, kind: str, limits: str, default: str) -> None:
-    row = next(row for row in SETTINGS if row.startswith(f"| `{setting}` |"))
-    assert [cell.strip() for cell in row.split("|")[2:5]] == [kind, limits, default]
+def test_settings_state_type_range_and_default(name: str, kind: str, limits: str, default: str) -> None:
+    setting = SETTINGS[name]
+    assert (setting.kind, setting.limits, setting.default) == (kind, limits, default)
 
 
 def test_every_metric_is_in_the_reference_in_its_group() -> None:
@@ -64,6 +55,6 @@ def test_every_metric_is_in_the_reference_in_its_group() -> None:
 def test_every_command_is_in_the_reference() -> None:
     commands = re.findall(r"^  ([a-z]+) ", USAGE, re.MULTILINE)
     assert list(COMMANDS) == commands
-    text = REFERENCE.command_sections()
+    page = (DOCS / "reference" / "commands.md").read_text("utf-8")
     for command in [*commands, "certs init", "certs issue", "certs revoke"]:
-        assert f" daedalus {command}\n\n```text\nusage: daedalus {command} " in text
+        assert f"# daedalus {command}\n" in page

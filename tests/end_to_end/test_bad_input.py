@@ -17,17 +17,11 @@ Start = Callable[..., Running]
     ("words", "status", "message"),
     [
         (["train", "cartpol"], 2, r"unknown preset 'cartpol': did you mean cartpole"),
-        (
-            ["train", "cartpole", "--set", "training.learning_rat=1"],
-            2,
-            r"did you mean training\.learning_rate",
-        ),
         (["train", "cartpole", "--set", "learning_rate=7"], 2, r"write section.key=value"),
         (["learner", "cartpole", "--algorithm", "absent:A"], 2, "training.algorithm=absent:A: cannot import absent"),
         (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
         (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
         (["train", "cartpole", "--init-from", "nowhere"], 2, r"--init-from: nowhere does not exist"),
-        (["evaluate", "nowhere"], 1, r"nowhere does not exist: name a run directory"),
         (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere does not exist: name a run directory"),
         (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
         (

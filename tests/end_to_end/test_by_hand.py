@@ -1,14 +1,12 @@
 """Test of learner and actors that are started separately, in any order."""
 
 import json
-import os
 import re
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from learner_status import actor_status, env_steps, learner_status
+from learner_status import env_steps, learner_status
 from processes import Running, until
 
 Start = Callable[..., Running]
@@ -51,20 +49,6 @@ def test_an_actor_that_joins_late_is_trained_on(start: Start, address: str) -> N
     assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 128, "late": 8}
     learner.process.terminate()
     assert learner.wait() == 0
-
-
-@pytest.mark.parametrize("algorithm", ["a2c", "impala"])
-def test_a_killed_actor_does_not_stop_the_others(start: Start, address: str, algorithm: str) -> None:
-    learner = start("learner", "cartpole", "--algorithm", algorithm, "--listen", address, "--run-dir", "run", *ENDLESS)
-    victim = start("actor", "--connect", address, "--name", "victim")
-    start("actor", "--connect", address, "--name", "other")
-    until(lambda: all(env_steps(learner_status(address), name) > 0 for name in ("victim", "other")))
-    os.kill(victim.process.pid, signal.SIGKILL)
-    victim.wait()
-    before = env_steps(learner_status(address), "other")
-    until(lambda: env_steps(learner_status(address), "other") > before + 10_000)
-    until(lambda: actor_status(learner_status(address), "victim").get("alive") is False)
-    assert learner.process.poll() is None
 
 
 def test_actors_find_a_learner_that_was_restarted(start: Start, address: str, tmp_path: Path) -> None:

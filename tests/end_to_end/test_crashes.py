@@ -13,16 +13,12 @@ Start = Callable[..., Running]
 # A module, and an assignment in it that makes the named thread raise the next time it works.
 LEARNER_FAULTS = {
     "intake": "daedalus.learner.serving.rollout_judge:RolloutJudge.read",
-    "compact snapshots": "daedalus.learner.serving.compact_snapshot_cache:CompactSnapshotCache.answer",
     "recorder": "daedalus.learner.reporting.csv_writer:CsvWriter.write",
-    "session watchdog": "daedalus.learner.serving.session_watchdog:SessionWatchdog._watch",
     "a Zenoh thread that reports presence": "daedalus.learner.serving.fleet:Fleet.set_present",
-    "a Zenoh thread that answers a join": "daedalus.learner.serving.query_responses:QueryResponses.join",
 }
 
 ACTOR_FAULTS = {
     "a Zenoh thread that brings an answer": "daedalus.actor.session.in_flight_rollouts:InFlightRollouts.acknowledge",
-    "a Zenoh thread that reports the learner": "daedalus.actor.session.learner_presence:LearnerPresence.on_presence",
     "a Zenoh thread that brings a snapshot": "daedalus.actor.session.learner_presence:LearnerPresence.heard",
 }
 
@@ -62,7 +58,7 @@ def test_an_exception_in_a_thread_of_the_learner_ends_it(
     learner = Faulty(
         tmp_path, "learner", LEARNER_FAULTS[thread], "cartpole", "--listen", address, "--run-dir", "run", *endless
     )
-    actor = start("actor", "--connect", address, "--link", "wan" if thread == "compact snapshots" else "lan")
+    actor = start("actor", "--connect", address)
     learner.assert_crashes()
     assert actor.process.poll() is None  # it looks for the learner that a supervisor would restart
 

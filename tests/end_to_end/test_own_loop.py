@@ -38,17 +38,6 @@ def test_a_learner_trains_from_a_loop_that_the_caller_owns(
     loop.expect("the run is over")
 
 
-def test_a_client_takes_part_in_a_synchronous_run(
-    start: Callable[..., Running], address: str, example: Callable[..., Running]
-) -> None:
-    words = ("learner", "cartpole", "--algorithm", "a2c", "--env-steps", 1000, "--actors", 1, "--run-dir", "run")
-    learner = start(*words, "--listen", address, "--set", "collection.rollout_length=32")
-    loop = example("--name", "robot")
-    assert learner.wait() == 3, learner.output  # the budget ended without the target
-    assert loop.wait() == 0, loop.output
-    loop.expect("the run is over")
-
-
 @pytest.mark.parametrize(("algorithm", "environments"), [("appo", 1), ("a2c", 3)])
 def test_the_agents_of_one_loop_are_one_actor(
     start: Callable[..., Running],
@@ -58,19 +47,8 @@ def test_the_agents_of_one_loop_are_one_actor(
     algorithm: str,
     environments: int,
 ) -> None:
-    words = (
-        "--algorithm",
-        algorithm,
-        "--set",
-        "collection.rollout_length=64",
-        "--env-steps",
-        6_000,
-        "--actors",
-        1,
-        "--run-dir",
-        "run",
-    )
-    learner = start("learner", "cartpole", *words, "--listen", address)
+    sizes = ("--set", "collection.rollout_length=64", "--env-steps", 6_000, "--actors", 1, "--run-dir", "run")
+    learner = start("learner", "cartpole", "--algorithm", algorithm, *sizes, "--listen", address)
     loop = example("--name", "robots", "--agents", "3", script=AGENTS)
     loop.expect(f"joined run 'run' as 'robots': {environments} x CartPole-v1")
     assert learner.wait() == 3, learner.output  # the budget ended without the target

@@ -5,10 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from certificates import make_certificates
+from certificates import change_certificates, make_certificates
 from processes import Running, until
-
-from daedalus.cli.commands.certs import certs
 
 Start = Callable[..., Running]
 
@@ -23,23 +21,15 @@ def tls(address: str) -> str:
     return address.replace("tcp/", "tls/")
 
 
-def test_authorised_actors_solve_cartpole_over_tls(start: Start, tls: str, certificates: Path) -> None:
-    learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
-    arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
-    box = start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box")
-    arm.expect(r"joined run 'run' as 'arm\.[\w-]+-\d+'")
-    box.expect("joined run")
-    assert learner.wait() == 0, learner.output
-    assert arm.wait() == 0, arm.output
-
-
 def test_authorised_actors_of_other_machines_join_train_over_tls(start: Start, tls: str, certificates: Path) -> None:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     training = ("--listen", tls, "--tls", certificates / "learner", "--actors", 1, *endless)
     train = start("train", "cartpole", *training)
     train.expect("return .* actors 1")
-    start("actor", "--connect", tls, "--tls", certificates / "actor-arm").expect("joined run")
-    train.expect("actors 2")
+    arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
+    arm.expect(r"joined run .* as 'arm\.[\w-]+-\d+'")
+    start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box").expect("as 'box'")
+    train.expect("actors 3")
     asking = ("status", "--connect", tls, "--quiet", "--tls")
     assert start(*asking, certificates / "actor-arm").wait() == 2
     until(lambda: start(*asking, certificates / "operator").wait() == 0)
@@ -55,10 +45,10 @@ def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls
     box = start("actor", "--connect", tls, "--tls", certificates / "actor-box")
     for actor in (arm, box):
         actor.expect("joined run")
-    assert certs(["revoke", "actor", "arm", "--directory", str(certificates)]) == 0
+    change_certificates(certificates, "revoke actor arm")
     assert arm.wait() == 1
     arm.expect(r"the service at .* refuses the certificate in .*kept: it was revoked, or issued after")
-    assert certs(["issue", "actor", "late", "--directory", str(certificates)]) == 0
+    change_certificates(certificates, "issue actor late")
     router.expect("2 actors and 1 operators are authorised; all connections are renewed")
     trained = len(learner.lines)
     start("actor", "--connect", tls, "--tls", certificates / "actor-late").expect("joined run")

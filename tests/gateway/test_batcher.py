@@ -12,8 +12,7 @@ from daedalus.actor.collecting.rollout_writer import RowInputs
 from daedalus.gateway import batcher
 from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
-from daedalus.gateway.client_uploads import ClientUploads
-from daedalus.gateway.outbox import Outbox
+from daedalus.gateway.client_uploads import ClientUploads, Outbox
 from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.noise import Noise, NoiseSize, neutral_noise
 from daedalus.policy.acting.runtime import Choice

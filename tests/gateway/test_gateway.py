@@ -19,8 +19,8 @@ from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.gateway import connection, policy_versions, server
 from daedalus.gateway import gateway as gateway_module
 from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.client_messages import Act
 from daedalus.gateway.gateway import Gateway
-from daedalus.gateway.messages import Act
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, PolicyError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode

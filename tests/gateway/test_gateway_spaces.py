@@ -15,8 +15,8 @@ from scripted_learner import Policy, ScriptedLearner
 
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.client_spaces import ClientSpaces
-from daedalus.gateway.errors import ClientError
 from daedalus.protocol.messages import Join
 from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.protocol.uploads import Rollout

@@ -8,7 +8,7 @@ from watched import FakeSource, actor_status, run_status
 
 from daedalus.gateway.watching import monitor as monitor_module
 from daedalus.gateway.watching.monitor import RunMonitor
-from daedalus.gateway.watching.observation import Observation
+from daedalus.gateway.watching.page_data import Observation
 from daedalus.protocol.messages import Event
 
 

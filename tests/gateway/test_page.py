@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 from browser import Visit, chromium
+from certificates import make_certificates
 from gateways import RunningGateway
 from processes import LIMIT, Running, starting, until
 from scripted_learner import SPEC, ScriptedLearner, acknowledge
 from watched import HOSTILE, actor_status, observed, run_status
 
-from daedalus.cli.commands.certs import certs
 from daedalus.gateway.places import Places
-from daedalus.gateway.tokens import OperatorToken
+from daedalus.gateway.security import OperatorToken
 from daedalus.protocol.messages import Event, Order
 from daedalus.transport.connecting import connect
 from daedalus.transport.memory import MemoryNetwork
@@ -256,9 +256,7 @@ def test_play_takes_no_part_in_a_run_of_another_environment(network: MemoryNetwo
 def test_play_beyond_loopback_needs_the_token_of_its_name(
     network: MemoryNetwork, learner: ScriptedLearner, visit: Open, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "certs"
-    for words in (["init", str(folder)], ["issue", "gateway"], ["issue", "client", "phone"]):
-        assert certs(words if words[0] == "init" else [*words, "--directory", str(folder)]) == 0
+    folder = make_certificates(tmp_path / "certs", "gateway", "client phone")
     running = RunningGateway(network, folder / "gateway")
     try:
         # The test does not install the CA in the browser, as the visitor of a phone would.

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 from scripted_learner import ScriptedLearner
 
-from daedalus.gateway import messages
-from daedalus.gateway.errors import ErrorCode
+from daedalus.gateway import client_messages
+from daedalus.gateway.client_messages import ErrorCode
 from daedalus.transport.memory import MemoryNetwork
 
 SCHEMA = json.loads(importlib.resources.files("daedalus.gateway").joinpath("protocol.json").read_text())
@@ -45,9 +45,11 @@ def check(message: dict[str, Any], side: str) -> None:
 
 def test_schema_is_one_and_knows_every_message_and_code() -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-    assert [entry["$ref"].rpartition("/")[2] for entry in SCHEMA["$defs"]["client"]["oneOf"]] == list(messages._FIELDS)
+    assert [entry["$ref"].rpartition("/")[2] for entry in SCHEMA["$defs"]["client"]["oneOf"]] == list(
+        client_messages._FIELDS
+    )
     assert SCHEMA["$defs"]["error"]["properties"]["code"]["enum"] == list(get_args(ErrorCode))
-    for kind, (required, optional) in messages._FIELDS.items():
+    for kind, (required, optional) in client_messages._FIELDS.items():
         definition = SCHEMA["$defs"][kind]
         assert set(definition["required"]) == {"type", *required}
         assert set(definition["properties"]) == {"type", *required, *optional}

@@ -19,17 +19,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from certificates import change_certificates, make_certificates
 from gateways import JsonClient, RunningGateway
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
 from websockets.exceptions import ConnectionClosed
 
-from daedalus.cli.commands.certs import certs
 from daedalus.gateway import app, places, server
-from daedalus.gateway.errors import ClientError
-from daedalus.gateway.rate_limit import RateLimit
-from daedalus.gateway.security import guard
-from daedalus.gateway.tokens import TOKENS, Tokens, digest
+from daedalus.gateway.client_messages import ClientError
+from daedalus.gateway.security import TOKENS, RateLimit, Tokens, digest, guard
 from daedalus.transport.memory import MemoryNetwork
 
 Connect = Callable[..., JsonClient]
@@ -38,11 +36,7 @@ Connect = Callable[..., JsonClient]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Certificates of a gateway, and tokens of two clients."""
-    made = tmp_path_factory.mktemp("certificates") / "certs"
-    assert certs(["init", str(made)]) == 0
-    assert certs(["issue", "gateway", "--directory", str(made)]) == 0
-    assert certs(["issue", "client", "phone", "arm", "--directory", str(made)]) == 0
-    return made
+    return make_certificates(tmp_path_factory.mktemp("certificates") / "certs", "gateway", "client phone arm")
 
 
 @pytest.fixture
@@ -99,22 +93,19 @@ def test_connection_without_tls_is_not_served(secured: RunningGateway) -> None:
 
 
 def test_revoked_and_expired_tokens_are_refused_without_a_restart(tmp_path: Path) -> None:
-    made = tmp_path / "certs"
-    assert certs(["init", str(made)]) == 0
-    assert certs(["issue", "client", "phone", "--directory", str(made)]) == 0
-    assert certs(["issue", "gateway", "--directory", str(made)]) == 0  # tokens of before are its own too
+    made = make_certificates(tmp_path / "certs", "client phone", "gateway")  # tokens of before are its own too
     tokens, given = Tokens(made / "gateway"), token(made, "phone")
     tokens.check("phone", given)
     record = made / "gateway" / TOKENS
     record.write_text(json.dumps({"phone": {"sha256": digest(given), "expires": 1.0}}))
     with pytest.raises(ClientError, match="the token has expired"):
         tokens.check("phone", given)
-    assert certs(["renew", "client", "phone", "--directory", str(made)]) == 0
+    change_certificates(made, "renew client phone")
     with pytest.raises(ClientError, match="not one of this name"):
         tokens.check("phone", given)
     renewed = token(made, "phone")
     tokens.check("phone", renewed)
-    assert certs(["revoke", "client", "phone", "--directory", str(made)]) == 0
+    change_certificates(made, "revoke client phone")
     with pytest.raises(ClientError, match="not one of this name"):
         tokens.check("phone", renewed)
     assert not (made / "client-phone").exists()
@@ -138,7 +129,7 @@ def test_token_files_are_readable_by_their_owner_only_and_keep_no_token(folder: 
 
 def test_list_shows_tokens(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
-    assert certs(["list", "--directory", str(folder)]) == 0
+    change_certificates(folder, "list")
     listed = capsys.readouterr().out
     assert "client-phone" in listed
     assert "gateway " in listed

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from processes import LIMIT
 
+from daedalus.gateway.client_uploads import Sender
 from daedalus.gateway.presence import Presence
-from daedalus.gateway.sender import Sender
 from daedalus.transport.interface import OnAnswer, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -93,7 +93,7 @@ def test_error_of_ours_is_reported(link: Link) -> None:
 
 
 def test_queries_that_wait_are_limited(link: Link, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.gateway.sender._MAX_QUERIES", 2)
+    monkeypatch.setattr("daedalus.gateway.client_uploads._MAX_QUERIES", 2)
     sender = Sender(link, unexpected)
     send(sender, b"a")
     send(sender, b"b")

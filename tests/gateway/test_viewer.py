@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from certificates import change_certificates, make_certificates
 from gateways import RunningGateway
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
@@ -20,11 +21,10 @@ from watched import FakeSource, actor_status, observed, run_status
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from daedalus.cli.commands.certs import certs
-from daedalus.gateway.errors import ClientError
+from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.places import Places
-from daedalus.gateway.tokens import TOKENS, OperatorToken, Tokens, digest
-from daedalus.gateway.watching.source import OtherRun
+from daedalus.gateway.security import TOKENS, OperatorToken, Tokens, digest
+from daedalus.gateway.watching.page_data import OtherRun
 from daedalus.transport.memory import MemoryNetwork
 
 TOKEN = "an operator's token of some length"
@@ -306,10 +306,7 @@ def test_pages_are_refused_under_another_name(gateway: RunningGateway) -> None:
 def test_beyond_loopback_a_page_needs_a_token_and_orders_that_of_an_operator(
     network: MemoryNetwork, tmp_path: Path
 ) -> None:
-    made = tmp_path / "certs"
-    assert certs(["init", str(made)]) == 0
-    assert certs(["issue", "gateway", "--directory", str(made)]) == 0
-    assert certs(["issue", "client", "phone", "--directory", str(made)]) == 0
+    made = make_certificates(tmp_path / "certs", "gateway", "client phone")
     phone = (made / "client-phone" / "token").read_text().strip()
     operator = (made / "operator" / "token").read_text().strip()
     running = RunningGateway(network, made / "gateway", follows=False)
@@ -333,22 +330,19 @@ def test_beyond_loopback_a_page_needs_a_token_and_orders_that_of_an_operator(
 
 
 def test_operators_tokens_are_issued_renewed_and_revoked_with_their_certificates(tmp_path: Path) -> None:
-    made = tmp_path / "certs"
-    assert certs(["init", str(made)]) == 0
-    assert certs(["issue", "gateway", "--directory", str(made)]) == 0
-    assert certs(["issue", "operator", "alice", "--directory", str(made)]) == 0
+    made = make_certificates(tmp_path / "certs", "gateway", "operator alice")
     tokens, path = Tokens(made / "gateway"), made / "operator-alice" / "token"
     assert path.stat().st_mode & 0o077 == 0
     first = path.read_text().strip()
     tokens.check_operator(first)
     with pytest.raises(ClientError, match="not one of this name"):
         tokens.check("alice", first)  # it is not that of a client
-    assert certs(["renew", "operator", "alice", "--directory", str(made)]) == 0
+    change_certificates(made, "renew operator alice")
     with pytest.raises(ClientError, match="needs an operator's token"):
         tokens.check_operator(first)
     second = path.read_text().strip()
     tokens.check_operator(second)
-    assert certs(["revoke", "operator", "alice", "--directory", str(made)]) == 0
+    change_certificates(made, "revoke operator alice")
     with pytest.raises(ClientError, match="needs an operator's token"):
         tokens.check_operator(second)
     assert not path.exists()

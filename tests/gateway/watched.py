@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from daedalus.gateway.watching.observation import Observation
+from daedalus.gateway.watching.page_data import Observation
 from daedalus.protocol.messages import ActorStatus, Event, EventsPage, MetricsPage, MetricsReport, Order, RunStatus
 from daedalus.transport.interface import TransportError
 

@@ -108,14 +108,3 @@ def test_long_names_are_cut_so_that_the_expected_ones_are_readable() -> None:
 def test_density_of_two_numbers_is_limited_to_twice_that_of_one(value: float, accepted: bool) -> None:
     log_probs = np.full(CELLS, value, np.float32)
     assert (verdict_on({**content(), "behaviour_log_probs": log_probs}) == "") == accepted
-
-
-def test_probability_of_discrete_actions_is_at_most_one() -> None:
-    assert "behaviour_log_probs has a value above 0" in _discrete_verdict(np.full(CELLS, 0.01, np.float32))
-    assert _discrete_verdict(np.full(CELLS, 5e-5, np.float32)) == ""
-
-
-def _discrete_verdict(log_probs: np.ndarray) -> str:
-    judge = RolloutJudge(run_spec(), EPOCH, joined_fleet("a"))
-    verdict = judge.read("a", encode(make_rollout(behaviour_log_probs=log_probs)))
-    return verdict.reason if isinstance(verdict, Rejected) else ""

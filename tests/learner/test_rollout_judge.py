@@ -9,7 +9,7 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from plain import ACTION, NAME, choices, plain, plain_spaces, vector_spaces
+from plain import ACTION, NAME, plain, plain_spaces, vector_spaces
 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge, acknowledgement
@@ -20,15 +20,17 @@ from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace,
 from daedalus.protocol.uploads import Rollout, Upload
 
 VERSION, MAX_LAG = 10, 4
+CELLS = (ROWS, ENVIRONMENTS)
 FENCED = ("epoch", "unknown_actor")  # the causes for which an actor joins again
 
 
 class Harness:
     """RolloutJudge with a fleet of actors `a` and `b`, at one policy version."""
 
-    def __init__(self, **training: Any) -> None:
-        self.fleet = joined_fleet("a", "b")
+    def __init__(self, *, spaces: Spaces = SPACES, state_size: int = 0, **training: Any) -> None:
+        self.fleet = joined_fleet("a", "b", spaces=spaces)
         self.judge = RolloutJudge(run_spec(max_policy_lag=MAX_LAG, **training), EPOCH, self.fleet)
+        self.judge.state_size = state_size
 
     def receive(self, data: bytes, sender: str = "a", now: float = 1.0) -> Upload | Rejected:
         return self.judge.decide(sender, self.judge.read(sender, data), VERSION, now)
@@ -54,23 +56,54 @@ def good(**replaced: Any) -> Rollout:
 def assert_rejected(harness: Harness, data: bytes, cause: str, reason: str = "", sender: str = "a") -> Rejected:
     """Assert that a message is rejected and counted under `cause`, and that a valid rollout is accepted afterwards."""
     before = harness.memory()
-    verdict = harness.receive(data, sender)
-    assert isinstance(verdict, Rejected)
+    verdict = rejection(harness.receive(data, sender))
     assert (verdict.verdict, verdict.cause) == ("fenced" if cause in FENCED else "rejected", cause)
     assert reason in verdict.reason
     assert harness.memory() == before
     if sender in harness.fleet.actors:
         assert harness.fleet.actors[sender].rejected == {cause: 1}
-    assert isinstance(harness.receive(encode(good(rollout_identity=identity(sequence=1000)))), Rollout)
+    fit = good(rollout_identity=identity(sequence=1000), state_size=harness.judge.state_size)
+    assert isinstance(harness.receive(encode(fit)), Rollout)
     return verdict
 
 
-def with_value(name: str, value: float) -> Rollout:
+def with_value(name: str, value: float, sequence: int = 0) -> Rollout:
     """Return a valid rollout with one value of one array replaced."""
     value_of = getattr(good(), name)
     array = (plain(value_of) if isinstance(value_of, dict) else value_of).copy()
     array.flat[-1] = value
-    return good(**{name: array})
+    return good(rollout_identity=identity(sequence=sequence), **{name: array})
+
+
+def ending(sequence: int, length: int, value: float = 1.0, environments: int = ENVIRONMENTS) -> Rollout:
+    """Return a rollout in whose last row an episode of this length ends in each environment."""
+    no, ends = np.zeros((2, ROWS, environments), np.bool_)
+    ends[-1] = True
+    return good(
+        rollout_identity=identity(sequence=sequence),
+        environments=environments,
+        terminated=ends,
+        truncated=no,
+        valid=~no,
+        episode_returns=np.full(environments, value, np.float32),
+        episode_lengths=np.full(environments, length, np.int64),
+    )
+
+
+def all_rows(*, ends: bool, valid: bool, episodes: int) -> Rollout:
+    """Return a rollout whose rows are all alike, and that reports this number of episodes."""
+    return good(
+        terminated=np.full(CELLS, ends),
+        truncated=np.full(CELLS, ends),
+        valid=np.full(CELLS, valid),
+        episode_returns=np.zeros(episodes, np.float32),
+        episode_lengths=np.ones(episodes, np.int32),
+    )
+
+
+def rejection(verdict: Upload | Rejected | None) -> Rejected:
+    assert isinstance(verdict, Rejected)
+    return verdict
 
 
 # ------------------------------------------------------------------------------------------- acceptance
@@ -89,13 +122,24 @@ def test_valid_rollout_is_accepted_unchanged(harness: Harness) -> None:
     assert acknowledgement(verdict, VERSION).policy_version == VERSION
 
 
-def test_same_sequence_number_from_two_actors_is_accepted_from_both(harness: Harness) -> None:
-    for actor in ("a", "b"):
-        assert isinstance(harness.receive(encode(good(rollout_identity=identity(actor))), actor), Rollout)
-
-
-def test_rollout_with_policy_lag_at_the_bound_is_accepted(harness: Harness) -> None:
-    assert isinstance(harness.receive(encode(good(version=VERSION - MAX_LAG))), Rollout)
+@pytest.mark.parametrize(
+    "rollout",
+    [
+        good(version=VERSION - MAX_LAG),
+        with_value("behaviour_log_probs", 0.99e-4),  # above 0 by rounding
+        with_value("rewards", -1e9),
+        with_value("frames", -1e15),
+        with_value("behaviour_log_probs", -1e6),
+        good(overridden=good().valid & (np.arange(ROWS) == ROWS - 1)[:, None]),
+        good(episode_info={f"{number:064}": np.ones(len(good().episode_returns), np.float32) for number in range(16)}),
+    ],
+    ids=["lag", "log-probability", "reward", "frame", "unlikely action", "overridden rows", "all info"],
+)
+def test_rollout_at_a_bound_is_accepted(harness: Harness, rollout: Rollout) -> None:
+    verdict = harness.receive(encode(rollout))
+    assert isinstance(verdict, Rollout)
+    assert verdict.env_steps == rollout.env_steps
+    assert verdict.episode_info.keys() == rollout.episode_info.keys()
 
 
 def test_acknowledgement_cuts_a_long_reason_to_500_characters(harness: Harness) -> None:
@@ -116,21 +160,17 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
     assert_rejected(harness, data, "malformed")
 
 
-def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> None:
-    weights = {str(number): np.zeros(1, np.float32) for number in range(37)}
-    data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
-    assert_rejected(harness, data, "malformed", "37 arrays, the limit is 36")
-
-
-def test_each_component_adds_its_arrays_to_the_limit() -> None:
+@pytest.mark.parametrize(("observations", "actions", "most"), [("a", "c", 36), ("ab", "cde", 41)])
+def test_message_with_many_arrays_is_rejected_as_malformed(observations: str, actions: str, most: int) -> None:
     """A component of the observation has one array, a component of the action two, with its masks."""
-    observation, action = ArraySpace(shape=(3,), dtype="float32"), DiscreteSpace(counts=(4,))
-    spaces = Spaces(observations={"a": observation, "b": observation}, actions=dict.fromkeys("cde", action))
-    weights = {str(number): np.zeros(1, np.float32) for number in range(42)}
+    spaces = Spaces(
+        observations=dict.fromkeys(observations, ArraySpace(shape=(3,), dtype="float32")),
+        actions=dict.fromkeys(actions, DiscreteSpace(counts=(4,))),
+    )
+    weights = {str(number): np.zeros(1, np.float32) for number in range(most + 1)}
     data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
-    verdict = stacked_harness(spaces).receive(data)
-    assert isinstance(verdict, Rejected)
-    assert verdict.reason == "42 arrays, the limit is 41"
+    verdict = rejection(Harness(spaces=spaces).receive(data))
+    assert (verdict.cause, verdict.reason) == ("malformed", f"{most + 1} arrays, the limit is {most}")
 
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
@@ -138,111 +178,93 @@ def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> N
     assert assert_rejected(harness, data, "malformed").reason == "the message is not a rollout"
 
 
+def shape_reason(rollout: Rollout) -> str:
+    return f"the rollout has {rollout.rows} rows of {rollout.environments} environments, expected {ROWS} rows of"
+
+
+WRONG_ROWS = [
+    good(rows=ROWS - 1),
+    good(rows=ROWS + 1),
+    good(environments=ENVIRONMENTS - 1),
+    good(environments=ENVIRONMENTS + 1),
+    good(rows=ROWS - 1, stack=2),  # the expected number of frames
+]
+WRONG_FRAMES = [
+    good(shape=(4,)),
+    good(shape=(2,)),
+    good(shape=(3, 1)),
+    good(stack=2),
+    good(frames=np.zeros((ROWS + 1, ENVIRONMENTS, 3), np.uint8)),
+]
+FLOATS = ("frames", "behaviour_log_probs", "rewards", "episode_returns")
+NO_NUMBERS = (np.nan, np.inf, -np.inf)
+
+
+def with_action(action: int) -> np.ndarray:
+    actions = plain(good().actions)[..., 0].astype(np.int32)
+    actions[-1, -1] = action
+    return actions
+
+
+def state_with(value: float) -> np.ndarray:
+    state = np.zeros((ENVIRONMENTS, 5))
+    state[-1, -1] = value
+    return state
+
+
 @pytest.mark.parametrize(
-    "rollout",
+    ("rollout", "reason"),
     [
-        good(rows=ROWS - 1),
-        good(rows=ROWS + 1),
-        good(environments=ENVIRONMENTS - 1),
-        good(environments=ENVIRONMENTS + 1),
-        good(rows=ROWS - 1, stack=2),  # the expected number of frames
+        *((rollout, shape_reason(rollout)) for rollout in WRONG_ROWS),
+        *((rollout, f"frames/observation is {plain(rollout.frames).dtype}") for rollout in WRONG_FRAMES),
+        *((rollout, f"expected float32 {(ROWS + 1, ENVIRONMENTS, 3)}") for rollout in WRONG_FRAMES),
+        *((good(state_size=size), f"initial_state has size {size}, expected 0") for size in (1, 7)),
+        *((good(actions=with_action(action)), "actions/action has a value") for action in (-1, 4, 2**31 - 1)),
+        *((with_value(name, value), name) for name in FLOATS for value in (*NO_NUMBERS, 3e38, -3e38)),
+        *((good(episode_info={"x": np.full(1, value, np.float32)}), "episode_info 'x'") for value in (np.nan, np.inf)),
+        (with_value("behaviour_log_probs", 1.01e-4), "behaviour_log_probs has a value above 0"),
+        (good(version=VERSION + 1), "is newer than the learner's version"),
+        (good(episode_lengths=np.zeros_like(good().episode_lengths)), "episode_lengths has a value below 1"),
+        # 100 invented returns once ended a run as solved.
+        (all_rows(ends=False, valid=True, episodes=7), "7 values, but 0 episodes ended"),
+        (ending(0, ROWS + 1), f"has played at most {ROWS} rows in each of its 3 env"),
+        (ending(0, 2**62), "the longest of 4611686018427387904"),
+        (ending(10**6, 100 * ROWS), f"at most {4 * ROWS} rows"),  # a sequence number alone proves nothing
+        (ending(0, ROWS, 1e12), "rewards within +-1e+09 do not add up to"),
+        (ending(0, ROWS, -3e38), "rewards within +-1e+09 do not add up to"),
+        (all_rows(ends=False, valid=False, episodes=0), "reset rule"),  # nothing was played
+        (all_rows(ends=True, valid=True, episodes=ROWS * ENVIRONMENTS), "reset rule"),
+        (all_rows(ends=True, valid=False, episodes=ROWS * ENVIRONMENTS), "a row that only resets"),
+        (good(overridden=~good().valid), "a row that only resets is overridden"),
+        (good(overridden=good().valid), "every row is overridden: there is none to learn from"),
+        # Values that no gradient survives.
+        (with_value("rewards", -1.01e9), "rewards has a value beyond +-1e+09: set environment.reward_scale"),
+        (with_value("frames", -1.01e15), "frames/observation has a value beyond +-1e+15: scale or clip the obs"),
+        (with_value("behaviour_log_probs", -1.01e6), "behaviour_log_probs has a value beyond +-1e+06"),
     ],
-    ids=["T too small", "T too large", "E too small", "E too large", "a stack for a row"],
 )
-def test_rollout_with_wrong_number_of_rows_or_environments_is_rejected_as_unfit(
-    harness: Harness, rollout: Rollout
-) -> None:
-    reason = f"the rollout has {rollout.rows} rows of {rollout.environments} environments, expected {ROWS} rows of"
+def test_unfit_rollout_is_rejected_with_its_fault_named(harness: Harness, rollout: Rollout, reason: str) -> None:
     assert_rejected(harness, encode(rollout), "unfit", reason)
 
 
 @pytest.mark.parametrize(
-    "rollout",
+    ("state", "reason"),
     [
-        good(shape=(4,)),
-        good(shape=(2,)),
-        good(shape=(3, 1)),
-        good(stack=2),
-        good(frames=np.zeros((ROWS + 1, ENVIRONMENTS, 3), np.uint8)),
+        *((np.zeros((ENVIRONMENTS, size)), f"initial_state has size {size}, expected 5") for size in (0, 4, 6)),
+        *((state_with(value), "initial_state has a value that is not finite") for value in NO_NUMBERS),
+        *((state_with(value), "initial_state has a value beyond +-1.001") for value in (1.01, -1.01, 3e38)),
     ],
-    ids=["larger", "smaller", "more dimensions", "a stack", "dtype"],
 )
-def test_frames_with_wrong_shape_or_dtype_are_rejected_with_both_shapes_named(
-    harness: Harness, rollout: Rollout
-) -> None:
-    theirs = f"frames/observation is {plain(rollout.frames).dtype} {plain(rollout.frames).shape}"
-    verdict = assert_rejected(harness, encode(rollout), "unfit", theirs)
-    assert f"expected float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
+def test_recurrent_state_that_no_gru_of_the_run_can_have_is_rejected(state: np.ndarray, reason: str) -> None:
+    harness = Harness(state_size=5)
+    assert assert_rejected(harness, encode(good(initial_state=state.astype(np.float32))), "unfit").reason == reason
+    ones = np.ones((ENVIRONMENTS, 5), np.float32)
+    assert isinstance(harness.receive(encode(good(initial_state=ones))), Rollout)
 
 
 def test_oversized_rollout_is_rejected_before_it_is_unpacked(harness: Harness) -> None:
     bomb = good(rows=4000, environments=500, frames=np.zeros((4001, 500, 3), np.float32))
     assert_rejected(harness, encode(bomb), "malformed", "the limit is")
-
-
-@pytest.mark.parametrize("action", [-1, choices(SPACES), 2**31 - 1])
-def test_action_out_of_range_is_rejected_as_unfit(harness: Harness, action: int) -> None:
-    actions = plain(good().actions)[..., 0].astype(np.int32)
-    actions[-1, -1] = action
-    assert_rejected(harness, encode(good(actions=actions)), "unfit", "action")
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["frames", "behaviour_log_probs", "rewards", "episode_returns"])
-def test_value_that_is_not_finite_is_rejected_with_its_array_named(harness: Harness, name: str, value: float) -> None:
-    assert_rejected(harness, encode(with_value(name, value)), "unfit", name)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_episode_info_that_is_not_finite_is_rejected(harness: Harness, value: float) -> None:
-    info = {"distance": np.full(1, value, np.float32)}
-    assert_rejected(harness, encode(good(episode_info=info)), "unfit", "episode_info 'distance'")
-
-
-def test_all_the_episode_info_that_a_rollout_may_have_is_accepted(harness: Harness) -> None:
-    most = len(good().episode_returns)
-    info = {f"{number:064}": np.full(most, 1.0, np.float32) for number in range(16)}
-    accepted = harness.receive(encode(good(episode_info=info)))
-    assert isinstance(accepted, Rollout)
-    assert accepted.episode_info.keys() == info.keys()
-
-
-def test_log_probability_above_0_is_rejected_as_unfit(harness: Harness) -> None:
-    assert_rejected(harness, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
-
-
-def test_log_probability_above_0_by_rounding_is_accepted(harness: Harness) -> None:
-    assert isinstance(harness.receive(encode(with_value("behaviour_log_probs", 0.99e-4))), Rollout)
-    assert isinstance(Harness().receive(encode(with_value("behaviour_log_probs", 1.01e-4))), Rejected)
-
-
-def test_rollout_with_a_future_policy_version_is_rejected_as_unfit(harness: Harness) -> None:
-    assert_rejected(harness, encode(good(version=VERSION + 1)), "unfit", "is newer than the learner's version")
-
-
-@pytest.mark.parametrize("size", [1, 7])
-def test_recurrent_state_is_rejected_when_the_policy_has_no_memory(harness: Harness, size: int) -> None:
-    reason = f"initial_state has size {size}, expected 0"
-    assert_rejected(harness, encode(good(state_size=size)), "unfit", reason)
-
-
-@pytest.mark.parametrize("size", [0, 4, 6])
-def test_recurrent_state_of_wrong_size_is_rejected(harness: Harness, size: int) -> None:
-    harness.judge.state_size = 5
-    verdict = harness.receive(encode(good(state_size=size)))
-    assert isinstance(verdict, Rejected)
-    assert verdict.reason == f"initial_state has size {size}, expected 5"
-    assert isinstance(harness.receive(encode(good(state_size=5))), Rollout)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_recurrent_state_that_is_not_finite_is_rejected(harness: Harness, value: float) -> None:
-    harness.judge.state_size = 5
-    state = np.zeros((ENVIRONMENTS, 5), np.float32)
-    state[-1, -1] = value
-    verdict = harness.receive(encode(good(initial_state=state)))
-    assert isinstance(verdict, Rejected)
-    assert verdict.reason == "initial_state has a value that is not finite"
 
 
 # ----------------------------------------------------------------------------------------------- stacks
@@ -251,31 +273,16 @@ STACKED = ArraySpace(shape=(60, 80, 3), dtype="uint8", frames=4)
 PICTURES = plain_spaces(STACKED, 4)
 
 
-def stacked_harness(spaces: Spaces = PICTURES, state_size: int = 0) -> Harness:
-    harness = Harness()
-    harness.fleet = joined_fleet("a", spaces=spaces)
-    harness.judge = RolloutJudge(run_spec(max_policy_lag=MAX_LAG), EPOCH, harness.fleet)
-    harness.judge.state_size = state_size
-    return harness
-
-
 def pixels(length: int = ROWS + 4, shape: tuple[int, ...] = STACKED.shape) -> np.ndarray:
     """Return noise, which is not compressible."""
     return np.random.default_rng(0).integers(0, 256, (length, ENVIRONMENTS, *shape), np.uint8)
 
 
-def test_stacked_observations_are_sent_as_single_frames() -> None:
-    rollout = good(frames=pixels())
-    verdict = stacked_harness().receive(encode(rollout))
-    assert isinstance(verdict, Rollout)
-    np.testing.assert_array_equal(plain(verdict.frames), plain(rollout.frames))
-
-
-def test_frames_with_environment_first_memory_layout_are_decoded_equally() -> None:
-    swapped = np.ascontiguousarray(pixels().swapaxes(0, 1)).swapaxes(0, 1)
-    verdict = stacked_harness().receive(encode(good(frames=swapped)))
-    assert isinstance(verdict, Rollout)
-    np.testing.assert_array_equal(plain(verdict.frames), pixels())
+def test_stacked_observations_are_sent_as_single_frames_in_either_memory_layout() -> None:
+    for frames in (pixels(), np.ascontiguousarray(pixels().swapaxes(0, 1)).swapaxes(0, 1)):
+        verdict = Harness(spaces=PICTURES).receive(encode(good(frames=frames)))
+        assert isinstance(verdict, Rollout)
+        np.testing.assert_array_equal(plain(verdict.frames), pixels())
 
 
 @pytest.mark.parametrize(
@@ -292,28 +299,26 @@ def test_frames_with_environment_first_memory_layout_are_decoded_equally() -> No
     ids=["no stack", "a smaller stack", "a larger stack", "turned", "grey", "stacked already", "a line less"],
 )
 def test_frames_with_wrong_stack_or_size_are_rejected(frames: np.ndarray) -> None:
-    verdict = stacked_harness().receive(encode(good(frames=frames)))
+    verdict = Harness(spaces=PICTURES).receive(encode(good(frames=frames)))
     assert isinstance(verdict, Rejected)
     assert ("the limit is" if verdict.cause == "malformed" else "frames/observation is uint8") in verdict.reason
 
 
 def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_frames() -> None:
-    largest = good(frames=pixels(), initial_state=np.zeros((ENVIRONMENTS, 40_000), np.float32))
-    every_second = np.broadcast_to((np.arange(ROWS) % 2 == 0)[:, None], (ROWS, ENVIRONMENTS)).copy()
+    every_second = np.broadcast_to((np.arange(ROWS) % 2 == 0)[:, None], CELLS).copy()
     most = int(every_second.sum())  # episodes of one row, each followed by a reset row
-    largest = dataclasses.replace(
-        largest,
-        actions={ACTION: plain(largest.actions).astype(np.int64)},
+    largest = good(
+        frames=pixels(),
+        initial_state=np.zeros((ENVIRONMENTS, 40_000), np.float32),
+        actions=plain(good().actions)[..., 0].astype(np.int64),
         terminated=every_second,
         truncated=np.zeros_like(every_second),
         valid=every_second,
         episode_returns=np.zeros(most, np.float32),
         episode_lengths=np.ones(most, np.int64),
     )
-    assert isinstance(stacked_harness(state_size=40_000).receive(encode(largest)), Rollout)
-    too_many = good(frames=pixels(2 * (ROWS + 4)))
-    verdict = stacked_harness().receive(encode(too_many))
-    assert isinstance(verdict, Rejected)
+    assert isinstance(Harness(spaces=PICTURES, state_size=40_000).receive(encode(largest)), Rollout)
+    verdict = rejection(Harness(spaces=PICTURES).receive(encode(good(frames=pixels(2 * (ROWS + 4))))))
     assert "the limit is" in verdict.reason
 
 
@@ -357,7 +362,7 @@ def test_large_message_of_a_sender_that_has_not_joined_is_fenced(spaces: Spaces 
 )
 def test_size_limit_is_the_documented_one(action: DiscreteSpace | ContinuousSpace, action_bytes: int) -> None:
     """E (T (24 + action bytes) + (T + k) frame bytes + 4 S) + 64 KiB, and the header: docs/wire.md."""
-    harness = stacked_harness(Spaces(observations={NAME: STACKED}, actions={ACTION: action}), state_size=7)
+    harness = Harness(spaces=Spaces(observations={NAME: STACKED}, actions={ACTION: action}), state_size=7)
     limit = ENVIRONMENTS * (ROWS * (24 + action_bytes) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
     message = Limits(max_bytes=limit).message_bytes
     assert harness.judge.refuse_size("a", message) is None
@@ -413,9 +418,7 @@ def test_rollout_of_an_actor_that_never_joined_is_fenced(harness: Harness) -> No
 
 
 def test_rollout_is_fenced_before_the_first_actor_has_joined() -> None:
-    judge = RolloutJudge(run_spec(), EPOCH, Fleet(1, None))
-    verdict = judge.read("a", encode(good()))
-    assert isinstance(verdict, Rejected)
+    verdict = rejection(RolloutJudge(run_spec(), EPOCH, Fleet(1, None)).read("a", encode(good())))
     assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
 
 
@@ -425,31 +428,16 @@ def test_rollout_of_an_incarnation_that_never_joined_is_fenced(harness: Harness,
     assert_rejected(harness, data, "unknown_actor", f"incarnation {incarnation} of 'a' is not the current one of 'a'")
 
 
-def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
-    harness.fleet.set_present("a", 1, False, 0.0)
-    harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    verdict = harness.receive(encode(good()))
-    assert isinstance(verdict, Rejected)
-    assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
-    assert isinstance(harness.receive(encode(good(rollout_identity=identity(incarnation=2)))), Rollout)
-
-
-def test_rollout_is_fenced_if_its_incarnation_was_replaced_while_it_was_decoded(harness: Harness) -> None:
-    content = harness.judge.read("a", encode(good()))
+@pytest.mark.parametrize("decoded_before", [False, True])
+def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness, decoded_before: bool) -> None:
+    data = encode(good())
+    content = harness.judge.read("a", data)
     assert isinstance(content, Rollout)
     harness.fleet.set_present("a", 1, False, 0.0)
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    verdict = harness.judge.decide("a", content, VERSION, 0.0)
-    assert isinstance(verdict, Rejected)
-    assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
-
-
-def test_duplicate_is_rejected_after_the_incarnation_was_replaced_and_joined_again(harness: Harness) -> None:
-    data = encode(good())
-    assert isinstance(harness.receive(data), Rollout)
-    for incarnation in (2, 1):
-        harness.fleet.join(Join(actor="a", incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    assert isinstance(harness.receive(data), Rejected)
+    verdict = harness.judge.decide("a", content, VERSION, 0.0) if decoded_before else harness.receive(data)
+    assert (rejection(verdict).verdict, rejection(verdict).cause) == ("fenced", "unknown_actor")
+    assert isinstance(harness.receive(encode(good(rollout_identity=identity(incarnation=2)))), Rollout)
 
 
 def test_rollout_with_the_identity_of_another_actor_is_fenced(harness: Harness) -> None:
@@ -458,24 +446,18 @@ def test_rollout_with_the_identity_of_another_actor_is_fenced(harness: Harness) 
     assert isinstance(harness.receive(encode(good(rollout_identity=identity("b"))), "b"), Rollout)
 
 
-def test_duplicate_rollout_is_rejected(harness: Harness) -> None:
-    assert isinstance(harness.receive(encode(good())), Rollout)
-    assert assert_rejected(harness, encode(good()), "duplicate").reason == "the rollout was received before"
-
-
-def test_stale_rollout_is_rejected_as_stale_first_and_as_duplicate_afterwards(harness: Harness) -> None:
-    data = encode(good(version=VERSION - MAX_LAG - 1))
-    verdicts = [harness.receive(data), harness.receive(data)]
-    found = [(verdict.verdict, verdict.cause) for verdict in verdicts if isinstance(verdict, Rejected)]
-    assert found == [("rejected", "stale"), ("rejected", "duplicate")]
-    assert harness.fleet.actors["a"].accepted == 0
+@pytest.mark.parametrize(("lag", "first"), [(0, "accepted"), (MAX_LAG + 1, "stale")])
+def test_rollout_that_arrives_again_is_rejected_as_duplicate(harness: Harness, lag: int, first: str) -> None:
+    data = encode(good(version=VERSION - lag))
+    verdict = harness.receive(data)
+    assert (verdict.cause if isinstance(verdict, Rejected) else "accepted") == first
+    assert rejection(harness.receive(data)).reason == "the rollout was received before"
+    assert harness.fleet.actors["a"].accepted == (first == "accepted")
 
 
 def test_a2c_rejects_older_versions_regardless_of_max_policy_lag() -> None:
     harness = Harness(algorithm="a2c")
-    late = harness.receive(encode(good(version=VERSION - 1)))
-    assert isinstance(late, Rejected)
-    assert late.cause == "stale"
+    assert rejection(harness.receive(encode(good(version=VERSION - 1)))).cause == "stale"
     assert isinstance(harness.receive(encode(good(rollout_identity=identity(sequence=1)))), Rollout)
 
 
@@ -495,7 +477,7 @@ def test_the_lag_bound_has_room_for_all_rollouts_in_flight_of_a_fleet_larger_tha
 
 
 def broken(sequence: int) -> bytes:
-    return encode(dataclasses.replace(with_value("rewards", np.nan), identity=identity(sequence=sequence)))
+    return encode(with_value("rewards", np.nan, sequence))
 
 
 def verdicts(harness: Harness, *messages: bytes) -> list[str]:
@@ -542,166 +524,33 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
     spec = run_spec(max_policy_lag=MAX_LAG)
     environment = spec.environment.model_copy(update={"reward_clip": 1.0, "reward_scale": 0.5})
     harness.judge = RolloutJudge(spec.model_copy(update={"environment": environment}), EPOCH, harness.fleet)
-    within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5 * (1 + 1e-5), np.float32))  # by rounding
-    beyond = good(rollout_identity=identity(sequence=1), rewards=np.full((ROWS, ENVIRONMENTS), 0.51, np.float32))
+    within = good(rewards=np.full(CELLS, -0.5 * (1 + 1e-5), np.float32))  # by rounding
     assert isinstance(harness.receive(encode(within)), Rollout)
-    verdict = harness.receive(encode(beyond))
-    assert isinstance(verdict, Rejected)
-    assert verdict.reason == "rewards has a value outside the clip range of +-0.5"
-
-
-def test_episode_length_of_0_is_rejected_as_unfit(harness: Harness) -> None:
-    lengths = np.zeros_like(good().episode_lengths)
-    verdict = assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit")
-    assert verdict.reason == "episode_lengths has a value below 1"
-
-
-def test_returns_of_episodes_that_did_not_end_are_rejected_as_unfit(harness: Harness) -> None:
-    """100 invented returns once ended a run as solved."""
-    none = np.zeros((ROWS, ENVIRONMENTS), np.bool_)
-    invented = {"episode_returns": np.full(7, 500, np.float32), "episode_lengths": np.full(7, 500, np.int32)}
-    rollout = good(terminated=none, truncated=none, valid=~none, **invented)
-    assert_rejected(harness, encode(rollout), "unfit", "7 values, but 0 episodes ended")
-
-
-def ending(sequence: int, length: int, value: float = 1.0) -> bytes:
-    """Return a rollout in whose last row an episode of this length ends in each environment."""
-    no = np.zeros((ROWS, ENVIRONMENTS), np.bool_)
-    ends = no.copy()
-    ends[-1] = True
-    episodes = {
-        "episode_returns": np.full(ENVIRONMENTS, value, np.float32),
-        "episode_lengths": np.full(ENVIRONMENTS, length, np.int64),
-    }
-    return encode(
-        good(rollout_identity=identity(sequence=sequence), terminated=ends, truncated=no, valid=~no, **episodes)
-    )
+    beyond = good(rollout_identity=identity(sequence=1), rewards=np.full(CELLS, 0.51, np.float32))
+    assert rejection(harness.receive(encode(beyond))).reason == "rewards has a value outside the clip range of +-0.5"
 
 
 def test_episodes_are_no_longer_than_the_rows_that_the_actor_has_sent(harness: Harness) -> None:
     """256 episodes of 500 env_steps in a first rollout of 512 rows once ended a run as solved."""
-    assert_rejected(harness, ending(0, ROWS + 1), "unfit", f"has played at most {ROWS} rows in each of its 3 env")
-    twice = Harness()
-    assert isinstance(twice.receive(ending(0, ROWS)), Rollout)
-    assert isinstance(twice.receive(ending(1, ROWS)), Rollout)
-    verdict = twice.receive(ending(2, 2 * ROWS))
-    assert isinstance(verdict, Rejected)
+    for sequence in range(2):
+        assert isinstance(harness.receive(encode(ending(sequence, ROWS))), Rollout)
+    verdict = rejection(harness.receive(encode(ending(2, 2 * ROWS))))
     assert f"episodes of {6 * ROWS} env_steps, the longest of {2 * ROWS}, and {6 * ROWS} before" in verdict.reason
-    assert_rejected(Harness(), ending(0, 2**62), "unfit", "the longest of 4611686018427387904")
 
 
 def test_rollouts_that_were_lost_count_as_far_as_others_have_arrived(harness: Harness) -> None:
-    """A sequence number alone proves nothing."""
-    assert_rejected(Harness(), ending(10**6, 100 * ROWS), "unfit", f"at most {4 * ROWS} rows")
     for sequence in range(0, 20, 2):
         assert isinstance(harness.receive(encode(good(rollout_identity=identity(sequence=sequence)))), Rollout)
-    assert isinstance(harness.receive(ending(20, 15 * ROWS)), Rollout)
+    assert isinstance(harness.receive(encode(ending(20, 15 * ROWS))), Rollout)
 
 
 def test_a_client_may_have_played_rows_that_it_does_not_send() -> None:
     """As while a person steers: but no more than an environment can play in the time."""
-    fleet = joined_fleet("a", environments=1)
-    judge = RolloutJudge(run_spec(max_policy_lag=MAX_LAG), EPOCH, fleet)
-
-    def verdict(length: int, sequence: int, now: float) -> Upload | Rejected:
-        no, ends = np.zeros((2, ROWS, 1), np.bool_)
-        ends[-1] = True
-        episodes = {"episode_returns": np.ones(1, np.float32), "episode_lengths": np.full(1, length, np.int64)}
-        rollout = good(
-            rollout_identity=identity(sequence=sequence),
-            environments=1,
-            terminated=ends,
-            truncated=no,
-            valid=~no,
-            **episodes,
-        )
-        return judge.decide("a", judge.read("a", encode(rollout)), VERSION, now)
-
-    assert isinstance(verdict(100_000, 0, 1.0), Rollout)
-    assert isinstance(verdict(1_000_000, 1, 10.0), Rejected)
-    assert isinstance(verdict(1_000_000, 1, 200.0), Rollout)
-
-
-@pytest.mark.parametrize("value", [1e12, -3e38])
-def test_returns_that_no_rewards_add_up_to_are_rejected_as_unfit(harness: Harness, value: float) -> None:
-    assert_rejected(harness, ending(0, ROWS, value), "unfit", "rewards within +-1e+09 do not add up to")
-
-
-@pytest.mark.parametrize(
-    ("ends", "valid", "reason"),
-    [
-        (False, False, "reset rule"),  # nothing was played
-        (True, True, "reset rule"),  # an episode ends in every row
-        (True, False, "a row that only resets"),
-    ],
-)
-def test_rows_that_break_the_reset_rule_are_rejected_as_unfit(
-    harness: Harness, ends: bool, valid: bool, reason: str
-) -> None:
-    rows = (ROWS, ENVIRONMENTS)
-    count = ROWS * ENVIRONMENTS if ends else 0
-    rollout = good(
-        terminated=np.full(rows, ends),
-        truncated=np.full(rows, ends),
-        valid=np.full(rows, valid),
-        episode_returns=np.zeros(count, np.float32),
-        episode_lengths=np.ones(count, np.int32),
-    )
-    assert_rejected(harness, encode(rollout), "unfit", reason)
-
-
-@pytest.mark.parametrize(
-    ("rows", "reason"),
-    [
-        ("reset", "a row that only resets is overridden"),
-        ("all", "every row is overridden: there is none to learn from"),
-    ],
-)
-def test_overridden_rows_that_no_client_sends_are_rejected_as_unfit(harness: Harness, rows: str, reason: str) -> None:
-    plain = good()
-    assert not plain.valid.all()
-    overridden = ~plain.valid if rows == "reset" else plain.valid
-    assert_rejected(harness, encode(good(overridden=overridden)), "unfit", reason)
-
-
-def test_overridden_rows_are_accepted_and_not_counted() -> None:
-    overridden = good().valid.copy()
-    overridden[:-1] = False
-    assert overridden.any()
-    verdict = Harness().receive(encode(good(overridden=overridden)))
-    assert isinstance(verdict, Rollout)
-    assert verdict.env_steps == good().env_steps - np.count_nonzero(overridden)
-
-
-@pytest.mark.parametrize(
-    ("name", "largest", "reason"),
-    [
-        ("rewards", 1e9, "rewards has a value beyond +-1e+09: set environment.reward_scale"),
-        ("frames", 1e15, "frames/observation has a value beyond +-1e+15: scale or clip the observations"),
-        ("behaviour_log_probs", 1e6, "behaviour_log_probs has a value beyond +-1e+06"),
-    ],
-)
-def test_values_that_no_gradient_survives_are_rejected_as_unfit(
-    harness: Harness, name: str, largest: float, reason: str
-) -> None:
-    assert isinstance(Harness().receive(encode(with_value(name, -largest))), Rollout)
-    assert_rejected(harness, encode(with_value(name, -1.01 * largest)), "unfit", reason)
-    for value in (3e38, -3e38):
-        verdict = Harness().receive(encode(with_value(name, value)))
-        assert isinstance(verdict, Rejected)
-        assert verdict.cause == "unfit"
-
-
-@pytest.mark.parametrize("value", [1.01, -1.01, 3e38])
-def test_state_that_no_gru_can_have_is_rejected_as_unfit(value: float) -> None:
     harness = Harness()
-    harness.judge.state_size = 5
-    state = np.ones((ENVIRONMENTS, 5), np.float32)
-    assert isinstance(harness.receive(encode(good(initial_state=state))), Rollout)
-    state[1, 2] = value
-    verdict = harness.receive(encode(good(rollout_identity=identity(sequence=1), initial_state=state)))
-    assert isinstance(verdict, Rejected)
-    assert verdict.reason == "initial_state has a value beyond +-1.001"
+    harness.judge = RolloutJudge(run_spec(max_policy_lag=MAX_LAG), EPOCH, joined_fleet("a", environments=1))
+    played = [(100_000, 0, 1.0), (1_000_000, 1, 10.0), (1_000_000, 1, 200.0)]
+    verdicts = [harness.receive(encode(ending(n, length, environments=1)), now=now) for length, n, now in played]
+    assert [isinstance(verdict, Rollout) for verdict in verdicts] == [True, False, True]
 
 
 # ---------------------------------------------------------------------------------------- at most once

@@ -10,7 +10,7 @@ import zstandard
 from golden import MESSAGES, path
 from wire_format import PREFIX, the_same, unwire, wire
 
-from daedalus.protocol.codec import FIRST_VERSION, PROTOCOL_VERSION, VersionMismatchError, decode, encode
+from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Message
 
@@ -43,15 +43,6 @@ def test_bytes_match_the_golden_bytes(name: str) -> None:
     flags, content, body = unwire(plain(encode(MESSAGES[name])))
     content["fields"] = old_part(content["fields"], unwire(golden)[1]["fields"])
     assert wire(content, body, flags=flags) == golden
-
-
-@pytest.mark.parametrize("name", MESSAGES)
-@pytest.mark.parametrize("version", [FIRST_VERSION - 1, PROTOCOL_VERSION + 1])
-def test_bytes_of_other_versions_are_rejected_with_their_version(name: str, version: int) -> None:
-    written = path(name).read_bytes()
-    other = written[:4] + version.to_bytes(2, "little") + written[6:]
-    with pytest.raises(VersionMismatchError, match=f"version {version}, this one {PROTOCOL_VERSION}"):
-        decode(other, Limits())
 
 
 def test_contents_of_the_golden_messages_are_stored_as_json() -> None:

@@ -40,16 +40,21 @@ def test_environment_is_the_only_required_section() -> None:
     assert run(training={"algorithm": "a2c"}).algorithm.synchronous
 
 
+SECTIONS = {
+    "environment": (EnvironmentSpec, ENVIRONMENT),
+    "policy": (PolicySpec, {}),
+    "collection": (CollectionSpec, {}),
+    "training": (TrainingSpec, {}),
+    "evaluation": (EvaluationSpec, {}),
+    "service": (ServiceSpec, {}),
+}
+
+
 @pytest.mark.parametrize(
     ("specification", "fields"),
     [
         (RunSpec, {"environment": ENVIRONMENT}),
-        (EnvironmentSpec, ENVIRONMENT),
-        (PolicySpec, {}),
-        (CollectionSpec, {}),
-        (TrainingSpec, {}),
-        (EvaluationSpec, {}),
-        (ServiceSpec, {}),
+        *SECTIONS.values(),
         (Spaces, SPACES),
         (ArraySpace, ARRAY),
         (DiscreteSpace, DISCRETE),
@@ -60,14 +65,10 @@ def test_unknown_field_is_rejected_by_name(specification: type[Specification], f
     specification.model_validate(fields)
     with pytest.raises(ValidationError, match=r"entropy_bonsu\n.*not permitted"):
         specification.model_validate({**fields, "entropy_bonsu": 1})
-
-
-@pytest.mark.parametrize("section", ["environment", "policy", "collection", "training", "evaluation", "service"])
-def test_unknown_fields_are_refused_within_sections(section: str) -> None:
-    content = {"environment": dict(ENVIRONMENT), section: {**(ENVIRONMENT if section == "environment" else {})}}
-    content[section]["typo"] = "1"
-    with pytest.raises(ValidationError, match=rf"{section}\.typo\n.*not permitted"):
-        RunSpec.model_validate(content)
+    for section, (its_specification, its_fields) in SECTIONS.items():
+        if its_specification is specification:
+            with pytest.raises(ValidationError, match=rf"{section}\.typo\n.*not permitted"):
+                run(**{section: {**its_fields, "typo": "1"}})
 
 
 @pytest.mark.parametrize("status", [ActorStatus, RunStatus])
@@ -76,115 +77,110 @@ def test_status_must_be_complete(status: type[Specification]) -> None:
         status.model_validate({})
 
 
-OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
-    (ArraySpace, "shape", [0]),
-    (ArraySpace, "shape", [-1]),
-    (ArraySpace, "shape", [1.5]),
-    (ArraySpace, "shape", []),
-    (ArraySpace, "shape", [2] * 5),
-    (ArraySpace, "dtype", "float64"),
-    (ArraySpace, "frames", 0),
-    (ArraySpace, "frames", 17),
-    (DiscreteSpace, "counts", []),
-    (DiscreteSpace, "counts", [0]),
-    (DiscreteSpace, "counts", [65_537]),
-    (DiscreteSpace, "counts", [2] * 4097),
-    (ContinuousSpace, "low", []),
-    (ContinuousSpace, "high", [math.inf]),
-    (Spaces, "observations", {}),
-    (Spaces, "actions", {}),
-    (Spaces, "actions", {"": DISCRETE}),
-    (Spaces, "actions", {"a b": DISCRETE}),
-    (Spaces, "actions", {"a" * 65: DISCRETE}),
-    (Spaces, "actions", {str(number): DISCRETE for number in range(65)}),
-    (Spaces, "observations", {"observation": CONTINUOUS}),
-    (EnvironmentSpec, "id", ""),
-    (EnvironmentSpec, "id", "x" * 201),
-    (EnvironmentSpec, "max_episode_steps", 0),
-    (EnvironmentSpec, "backend", "dm_control"),
-    (EnvironmentSpec, "action_table", [[0.0]]),
-    (EnvironmentSpec, "action_table", [[0.0], [math.inf]]),
-    (EnvironmentSpec, "action_repeat", 0),
-    (EnvironmentSpec, "action_repeat", 65),
-    (EnvironmentSpec, "no_reward_limit", 0),
-    (EnvironmentSpec, "crop", [0, 0, 0]),
-    (EnvironmentSpec, "crop", [0, 0, 0, -1]),
-    (EnvironmentSpec, "resize", [0, 84]),
-    (EnvironmentSpec, "resize", [84]),
-    (EnvironmentSpec, "frame_stack", 0),
-    (EnvironmentSpec, "frame_stack", 17),
-    (EnvironmentSpec, "reward_clip", 0.0),
-    (EnvironmentSpec, "reward_scale", 0.0),
-    (EnvironmentSpec, "reward_scale", math.nan),
-    (EnvironmentSpec, "kwargs", {"a": b"bytes"}),
-    (PolicySpec, "encoder", "cnn"),
-    (PolicySpec, "encoder", "module:"),
-    (PolicySpec, "memory", "lstm"),
-    (PolicySpec, "memory_units", 0),
-    (PolicySpec, "memory_units", 4097),
-    (PolicySpec, "hidden", [8] * 9),
-    (PolicySpec, "hidden", [0]),
-    (PolicySpec, "activation", "gelu"),
-    (CollectionSpec, "actors", 0),
-    (CollectionSpec, "envs_per_actor", 0),
-    (CollectionSpec, "envs_per_actor", 4097),
-    (CollectionSpec, "rollout_length", 0),
-    (CollectionSpec, "rollout_length", 4097),
-    (CollectionSpec, "window", 0),
-    (CollectionSpec, "window", 65),
-    (TrainingSpec, "algorithm", "ppo"),
-    (TrainingSpec, "seed", -1),
-    (TrainingSpec, "seed", 2**32),
-    (TrainingSpec, "env_steps", 0),
-    (TrainingSpec, "target_episodes", 0),
-    (TrainingSpec, "batch_rollouts", 0),
-    (TrainingSpec, "max_policy_lag", -1),
-    (TrainingSpec, "discount_factor", 1.01),
-    (TrainingSpec, "discount_factor", -0.01),
-    (TrainingSpec, "discount_factor", math.nan),
-    (TrainingSpec, "trace_lambda", 1.01),
-    (TrainingSpec, "rho_clip", 0.0),
-    (TrainingSpec, "trace_clip", 0.0),
-    (TrainingSpec, "passes", 0),
-    (TrainingSpec, "passes", 65),
-    (TrainingSpec, "minibatches", 0),
-    (TrainingSpec, "minibatches", 4097),
-    (TrainingSpec, "clip_range", 0.0),
-    (TrainingSpec, "device", "tpu"),
-    (TrainingSpec, "precision", "float16"),
-    (TrainingSpec, "value_loss", "mae"),
-    (TrainingSpec, "value_coefficient", -0.1),
-    (TrainingSpec, "entropy_bonus", -0.1),
-    (TrainingSpec, "entropy_bonus_final", -0.1),
-    (TrainingSpec, "optimizer", "sgd"),
-    (TrainingSpec, "learning_rate", 0.0),
-    (TrainingSpec, "learning_rate", 1.1),
-    (TrainingSpec, "learning_rate", math.nan),
-    (TrainingSpec, "learning_rate_final", -0.1),
-    (TrainingSpec, "optimizer_epsilon", 0.0),
-    (TrainingSpec, "rmsprop_decay", 1.1),
-    (TrainingSpec, "max_gradient_norm", 0.0),
-    (TrainingSpec, "threads", 0),
-    (EvaluationSpec, "seconds", 0.0),
-    (EvaluationSpec, "episodes", 0),
-    (EvaluationSpec, "final_episodes", 0),
-    (EvaluationSpec, "final_backend", "mujoco"),
-    (ServiceSpec, "checkpoint_seconds", 0.0),
-    (ServiceSpec, "keep_checkpoints", 0),
-    (ServiceSpec, "log_seconds", 0.0),
-    (ServiceSpec, "queue_megabytes", 0.0),
-]
+OUT_OF_RANGE: dict[type[Specification], dict[str, list[Any]]] = {
+    ArraySpace: {
+        "shape": [[0], [-1], [1.5], [], [2] * 5],
+        "dtype": ["float64"],
+        "frames": [0, 17],
+    },
+    DiscreteSpace: {
+        "counts": [[], [0], [65_537], [2] * 4097],
+    },
+    ContinuousSpace: {
+        "low": [[]],
+        "high": [[math.inf]],
+    },
+    Spaces: {
+        "observations": [{}, {"observation": CONTINUOUS}],
+        "actions": [
+            {},
+            {"": DISCRETE},
+            {"a b": DISCRETE},
+            {"a" * 65: DISCRETE},
+            {str(number): DISCRETE for number in range(65)},
+        ],
+    },
+    EnvironmentSpec: {
+        "id": ["", "x" * 201],
+        "max_episode_steps": [0],
+        "backend": ["dm_control"],
+        "action_table": [[[0.0]], [[0.0], [math.inf]]],
+        "action_repeat": [0, 65],
+        "no_reward_limit": [0],
+        "crop": [[0, 0, 0], [0, 0, 0, -1]],
+        "resize": [[0, 84], [84]],
+        "frame_stack": [0, 17],
+        "reward_clip": [0.0],
+        "reward_scale": [0.0, math.nan],
+        "kwargs": [{"a": b"bytes"}],
+    },
+    PolicySpec: {
+        "encoder": ["cnn", "module:"],
+        "memory": ["lstm"],
+        "memory_units": [0, 4097],
+        "hidden": [[8] * 9, [0]],
+        "activation": ["gelu"],
+    },
+    CollectionSpec: {
+        "actors": [0],
+        "envs_per_actor": [0, 4097],
+        "rollout_length": [0, 4097],
+        "window": [0, 65],
+    },
+    TrainingSpec: {
+        "algorithm": ["ppo"],
+        "seed": [-1, 2**32],
+        "env_steps": [0],
+        "target_episodes": [0],
+        "batch_rollouts": [0],
+        "max_policy_lag": [-1],
+        "discount_factor": [1.01, -0.01, math.nan],
+        "trace_lambda": [1.01],
+        "rho_clip": [0.0],
+        "trace_clip": [0.0],
+        "passes": [0, 65],
+        "minibatches": [0, 4097],
+        "clip_range": [0.0],
+        "device": ["tpu"],
+        "precision": ["float16"],
+        "value_loss": ["mae"],
+        "value_coefficient": [-0.1],
+        "entropy_bonus": [-0.1],
+        "entropy_bonus_final": [-0.1],
+        "optimizer": ["sgd"],
+        "learning_rate": [0.0, 1.1, math.nan],
+        "learning_rate_final": [-0.1],
+        "optimizer_epsilon": [0.0],
+        "rmsprop_decay": [1.1],
+        "max_gradient_norm": [0.0],
+        "threads": [0],
+    },
+    EvaluationSpec: {
+        "seconds": [0.0],
+        "episodes": [0],
+        "final_episodes": [0],
+        "final_backend": ["mujoco"],
+    },
+    ServiceSpec: {
+        "checkpoint_seconds": [0.0],
+        "keep_checkpoints": [0],
+        "log_seconds": [0.0],
+        "queue_megabytes": [0.0],
+    },
+}
 
 
-@pytest.mark.parametrize(("specification", "field", "value"), OUT_OF_RANGE)
+@pytest.mark.parametrize(
+    ("specification", "field"), [(each, field) for each, fields in OUT_OF_RANGE.items() for field in fields]
+)
 def test_value_out_of_range_is_rejected_with_the_name_of_its_field(
-    specification: type[Specification], field: str, value: Any
+    specification: type[Specification], field: str
 ) -> None:
     all_required = {ArraySpace: ARRAY, EnvironmentSpec: ENVIRONMENT, Spaces: SPACES, ContinuousSpace: CONTINUOUS}
-    required = all_required.get(specification, {})
-    with pytest.raises(ValidationError) as refused:
-        specification.model_validate({**required, field: value})
-    assert {error["loc"][0] for error in refused.value.errors()} == {field}
+    for value in OUT_OF_RANGE[specification][field]:
+        with pytest.raises(ValidationError) as refused:
+            specification.model_validate({**all_required.get(specification, {}), field: value})
+        assert {error["loc"][0] for error in refused.value.errors()} == {field}, value
 
 
 def test_a2c_refuses_a_batch_size_of_its_own() -> None:
@@ -204,15 +200,22 @@ def test_specification_is_restored_from_its_json() -> None:
 
 def test_spaces_have_a_readable_string() -> None:
     assert str(Spaces.model_validate(SPACES)) == "observation: float32 array of shape (4,); action: 2 choices"
+    spaces = Spaces.model_validate(
+        {
+            "observations": {"camera": {**ARRAY, "shape": [8, 8], "dtype": "uint8", "frames": 2}, "goal": DISCRETE},
+            "actions": {"arm": CONTINUOUS, "gripper": {**DISCRETE, "counts": [2, 3], "masked": True}},
+        }
+    )
+    assert str(spaces) == (
+        "observation: camera: uint8 array of shape (8, 8), 2 stacked, goal: 2 choices; "
+        "action: arm: 2 continuous, gripper: choices of 2 x 3, masked"
+    )
+    assert spaces.masks == {"gripper": 5}
 
 
 def test_stack_adds_an_axis_unless_it_has_one_frame() -> None:
-    one = ArraySpace(shape=(84, 96, 3), dtype="uint8")
-    four = ArraySpace(shape=(84, 96, 3), dtype="uint8", frames=4)
-    assert one.stacked_shape == (84, 96, 3)
-    assert four.stacked_shape == (4, 84, 96, 3)
-    assert str(one) == "uint8 array of shape (84, 96, 3)"
-    assert str(four) == "uint8 array of shape (84, 96, 3), 4 stacked"
+    assert ArraySpace(shape=(84, 96, 3), dtype="uint8").stacked_shape == (84, 96, 3)
+    assert ArraySpace(shape=(84, 96, 3), dtype="uint8", frames=4).stacked_shape == (4, 84, 96, 3)
 
 
 def test_stack_longer_than_a_rollout_is_rejected_with_a_remedy() -> None:
@@ -222,32 +225,27 @@ def test_stack_longer_than_a_rollout_is_rejected_with_a_remedy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "updates", "bound"),
+    ("fields", "collection", "updates", "bound"),
     [
-        ({"algorithm": "impala", "passes": 5}, 1, 32),
-        ({"algorithm": "a3c"}, 1, 8),
-        ({"algorithm": "appo", "passes": 3, "minibatches": 4}, 12, 384),
-        ({"algorithm": "appo", "passes": 1, "minibatches": 1}, 1, 32),
-        ({"algorithm": "appo", "passes": 3, "minibatches": 4, "max_policy_lag": 7}, 12, 7),
-        ({"algorithm": "a3c", "max_policy_lag": 0}, 1, 0),
+        ({"algorithm": "impala", "passes": 5}, {}, 1, 32),
+        ({"algorithm": "a3c"}, {}, 1, 8),
+        ({"algorithm": "appo", "passes": 3, "minibatches": 4}, {}, 12, 384),
+        ({"algorithm": "appo", "passes": 1, "minibatches": 1}, {}, 1, 32),
+        ({"algorithm": "appo", "passes": 3, "minibatches": 4, "max_policy_lag": 7}, {}, 12, 7),
+        ({"algorithm": "a3c", "max_policy_lag": 0}, {}, 1, 0),
+        # There is room for all rollouts in flight.
+        ({"algorithm": "a3c"}, {"actors": 2, "window": 2}, 1, 8),
+        ({"algorithm": "a3c"}, {"actors": 5, "window": 3}, 1, 30),
+        ({"algorithm": "impala"}, {"actors": 5, "window": 3}, 1, 32),
+        ({"algorithm": "impala"}, {"actors": 5, "window": 20}, 1, 40),
+        ({"algorithm": "appo", "passes": 3, "minibatches": 3}, {"actors": 1, "window": 1}, 9, 32 * 9),
     ],
 )
-def test_default_lag_bound_counts_batches(fields: dict[str, Any], updates: int, bound: int) -> None:
-    spec = RunSpec.model_validate({"environment": {"id": "e"}, "training": fields})
-    assert (spec.training.updates_per_batch, spec.policy_lag_bound_with(0)) == (updates, bound)
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "actors", "window", "bound"),
-    [("a3c", 2, 2, 8), ("a3c", 5, 3, 30), ("impala", 5, 3, 32), ("impala", 5, 20, 40), ("appo", 1, 1, 32 * 9)],
-)
-def test_default_lag_bound_has_room_for_all_rollouts_in_flight(
-    algorithm: str, actors: int, window: int, bound: int
+def test_default_lag_bound_counts_batches_and_rollouts_in_flight(
+    fields: dict[str, Any], collection: dict[str, Any], updates: int, bound: int
 ) -> None:
-    collection = {"actors": actors, "window": window}
-    training = {"algorithm": algorithm, "passes": 3, "minibatches": 3}
-    spec = RunSpec.model_validate({"environment": {"id": "e"}, "collection": collection, "training": training})
-    assert spec.policy_lag_bound_with(0) == bound
+    spec = run(training=fields, collection=collection)
+    assert (spec.training.updates_per_batch, spec.policy_lag_bound_with(0)) == (updates, bound)
 
 
 def test_every_algorithm_has_its_mathematics() -> None:
@@ -311,20 +309,6 @@ def test_join_with_the_largest_spaces_is_within_its_limits() -> None:
     spaces = Spaces.model_validate({"observations": many, "actions": {"a": LONGEST, "b": LONGEST}})
     join = Join(actor="a" * 64, incarnation=2**62, spaces=spaces, environments=4096)
     assert decode(encode(join), JOIN_LIMITS) == join
-
-
-def test_spaces_of_several_components_have_a_readable_string() -> None:
-    spaces = Spaces.model_validate(
-        {
-            "observations": {"camera": {**ARRAY, "shape": [8, 8], "dtype": "uint8", "frames": 2}, "goal": DISCRETE},
-            "actions": {"arm": CONTINUOUS, "gripper": {**DISCRETE, "counts": [2, 3], "masked": True}},
-        }
-    )
-    assert str(spaces) == (
-        "observation: camera: uint8 array of shape (8, 8), 2 stacked, goal: 2 choices; "
-        "action: arm: 2 continuous, gripper: choices of 2 x 3, masked"
-    )
-    assert spaces.masks == {"gripper": 5}
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,14 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
-from certificates import issue_expired, make_certificates, unchecked
-from processes import free_address
+from certificates import change_certificates, issue_expired, make_certificates, unchecked
+from routers import listen_somewhere
 
-from daedalus.cli.commands.certs import certs
 from daedalus.cli.commands.router import router
 from daedalus.learner.serving.session_watchdog import LOOK
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CredentialsError, load, with_remedy
-from daedalus.transport.interface import AddressInUseError, RefusedError, Transport, TransportError
+from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.zenoh_transport import connect, listen
 
 LIMIT = 60.0
@@ -32,15 +31,6 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def strange(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return certificates of another CA, with the same names."""
     return make_certificates(tmp_path_factory.mktemp("strange") / "certs")
-
-
-def listen_somewhere(folder: Path) -> tuple[str, Transport]:
-    while True:
-        address = free_address().replace("tcp/", "tls/")
-        try:
-            return address, listen([address], credentials=unchecked(folder, "router", ""))
-        except AddressInUseError:
-            continue
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +277,7 @@ def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path) -> No
 
 def test_gateway_certificate_is_neither_a_learners_nor_a_clients(certificates: Path) -> None:
     """Not even on the learner's own host: gateways have another CA, which no actor and no listener trusts."""
-    assert certs(["issue", "gateway", "--directory", str(certificates)]) == 0
+    change_certificates(certificates, "issue gateway")
     folder = certificates / "gateway"
     with pytest.raises(CredentialsError, match="holds the certificate of gateway, but learner is required"):
         load(folder, "learner")

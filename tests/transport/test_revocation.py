@@ -12,7 +12,7 @@ import pytest
 from certificates import make_certificates
 from log_lines import LINES
 from processes import LIMIT, until
-from test_access_control import listen_somewhere
+from routers import listen_somewhere
 
 from daedalus.launch.certificates import CertificateFolder, Identity
 from daedalus.protocol import keys

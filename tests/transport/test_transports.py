@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from processes import free_address
+from routers import listen_somewhere
 
 from daedalus.transport.interface import AddressInUseError, Request, Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -30,16 +31,6 @@ class Tape(queue.SimpleQueue[Any]):
 
     def next(self) -> Any:
         return self.get(timeout=WAIT)
-
-
-def listen_somewhere() -> tuple[str, Transport]:
-    for _ in range(10):
-        endpoint = free_address()
-        try:
-            return endpoint, listen([endpoint])
-        except AddressInUseError:  # another process took it meanwhile
-            continue
-    raise AssertionError("no free port")
 
 
 def memory_ends() -> MakeEnd:
