@@ -7,8 +7,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from daedalus.launch.logs import LEVELS
-from daedalus.launch.run_choice import MOST_PROCESSES
+from daedalus.launch.logs import LEVELS, LogOptions
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_words
 
 
@@ -45,23 +44,6 @@ def add_reset_statistics(options: argparse._ActionsContainer, only: str = "") ->
         help=f"{only}forget the sizes of observations and rewards that the checkpoint has, which the next rollouts "
         "then define anew: for a run that a broken sensor has spoiled",
     )
-
-
-def add_processes(options: argparse._ActionsContainer) -> None:
-    """Add --processes, the number of processes of a learner; None if it is not given."""
-    options.add_argument(
-        "--processes",
-        type=_processes,
-        metavar="N",
-        help="processes of the learner on this machine, each with training.threads threads, or with a GPU of its own. "
-        "Each computes the gradients of its share of every batch (default: 1)",
-    )
-
-
-def _processes(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= MOST_PROCESSES:
-        raise argparse.ArgumentTypeError(f"{text} is not a number from 1 to {MOST_PROCESSES}")
-    return int(text)
 
 
 def whole_number(text: str) -> int:
@@ -133,3 +115,8 @@ def add_logging(options: argparse._ActionsContainer) -> None:
         help="lowest severity of log records shown (default: %(default)s)",
     )
     options.add_argument("--log-json", action="store_true", help="write log records as JSON, one object per line")
+
+
+def log_options(arguments: argparse.Namespace) -> LogOptions:
+    """Return what the options of `add_logging` choose."""
+    return LogOptions(level=arguments.log_level, as_json=arguments.log_json)

@@ -5,6 +5,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TextIO
 
 from daedalus.protocol import keys
@@ -12,6 +13,31 @@ from daedalus.protocol.texts import printable, utc
 
 EVENTS = "daedalus.learner.serving.events"  # logger of the events of a run
 LEVELS = ("debug", "info", "warning", "error")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogOptions:
+    """How a process writes its log records."""
+
+    level: str = "info"  # lowest severity of the records shown, one of LEVELS
+    as_json: bool = False
+
+    def words(self) -> list[str]:
+        """Return the options for the command line of another process."""
+        return ["--log-level", self.level, *(["--log-json"] if self.as_json else [])]
+
+    def configure(
+        self,
+        *,
+        process: str = "",
+        context: Mapping[str, str] | None = None,
+        prefix: str = "",
+        write: Callable[[str], None] | None = None,
+    ) -> None:
+        """See configure_logging."""
+        configure_logging(
+            self.level, as_json=self.as_json, process=process, context=context, prefix=prefix, write=write
+        )
 
 
 def configure_logging(
