@@ -1,14 +1,13 @@
 """Rollouts joined on the environment axis, as tensors in reused memory."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.ranks import ONE_RANK, RankPart, Ranks
 from daedalus.policy.network.layers import Components, map_components
 from daedalus.protocol.frames import stack_rows
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
@@ -29,12 +28,6 @@ class Batch:
     terminated: Tensor  # [T, B] bool
     truncated: Tensor  # [T, B] bool; also where the next row is overridden: the return is bootstrapped there
     valid: Tensor  # [T, B] float32, 1 for the rows to learn from, 0 for reset rows and overridden rows
-    rank_part: RankPart | None = None  # part of a whole batch that this batch is; None: it is whole
-
-    @property
-    def ranks(self) -> Ranks:
-        """The processes that have the other parts of the whole batch."""
-        return ONE_RANK if self.rank_part is None else self.rank_part.ranks
 
     def to(self, device: torch.device) -> "Batch":
         """Return the batch on a device. Copies from pinned memory are asynchronous."""
@@ -44,30 +37,11 @@ class Batch:
         def moved(values: Tensor) -> Tensor:
             return values.to(device, non_blocking=True)
 
-        rank_part = self.rank_part and replace(self.rank_part, valid=moved(self.rank_part.valid))
-        return replace(self.map(moved), rank_part=rank_part)
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "Batch":
-        """Return the batch with `function` applied to each tensor; not to those of `rank_part`."""
         mapped: dict[str, Any] = {}
         for part in fields(self):
             values = getattr(self, part.name)
-            if isinstance(values, dict):
-                mapped[part.name] = map_components(values, function)
-            elif isinstance(values, Tensor):
-                mapped[part.name] = function(values)
-        return replace(self, **mapped)
-
-    def tensors(self) -> list[Tensor]:
-        """Return all tensors of the batch, in the order of the fields; not those of `rank_part`."""
-        found: list[Tensor] = []
-        for part in fields(self):
-            values = getattr(self, part.name)
-            if isinstance(values, dict):
-                found += values.values()
-            elif isinstance(values, Tensor):
-                found.append(values)
-        return found
+            mapped[part.name] = map_components(values, moved) if isinstance(values, dict) else moved(values)
+        return Batch(**mapped)
 
 
 class BatchAssembler:

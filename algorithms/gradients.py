@@ -14,7 +14,6 @@ from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.forward import FlatParameters, Forward
 from daedalus.algorithms.losses import mean, value_loss
 from daedalus.algorithms.own_algorithm import build_algorithm, check_updates
-from daedalus.algorithms.ranks import RankPart
 from daedalus.algorithms.recording import OperationRecorder
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
@@ -86,49 +85,31 @@ class GradientComputer:
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
 
-        The caller applies the gradient before it asks for the next update. Of a part of a batch, both are those of the
-        whole batch.
+        The caller applies the gradient before it asks for the next update.
         """
         # The statistics of observations do not change within a batch: normalise once for all passes.
         batch = replace(batch, observations=self._network.normalizer(batch.observations))
         bonus = torch.tensor(entropy_bonus, device=batch.valid.device)
-        updates = 0
         for losses in self._algorithm.losses(batch, self.forward):
             if not isinstance(losses, Losses | MinibatchLosses):
                 raise TypeError(f"losses() gives {type(losses).__name__}: it must yield Losses or MinibatchLosses")
-            updates += 1
             self._first_pass = losses.first_pass
             if isinstance(losses, MinibatchLosses):
-                gradient, *each = self._of_minibatch(losses, bonus, record=batch.rank_part is None)
-                shares = losses.minibatch.shares
+                gradient, *terms = self._of_minibatch(losses, bonus)
             else:
-                gradient, *each = self._differentiated(losses, bonus)
-                shares = losses.shares
+                gradient, *terms = self._differentiated(losses, bonus)
             self.parameters.gradients.copy_(gradient)
-            terms = Terms(*each)
-            if batch.rank_part is not None:
-                terms, _ = self._over_ranks(batch.rank_part, terms, shares)
-            yield terms
-        if batch.rank_part is not None:
-            yield from self._of_other_ranks(batch.rank_part, batch.rank_part.updates - updates)
+            yield Terms(*terms)
 
     def no_update(self) -> Terms:
         """Write a gradient of 0 and return terms of 0: for a batch of which an own algorithm makes no update."""
         self.parameters.gradients.zero_()
         return Terms(*self.parameters.gradients.new_zeros(len(Terms._fields)))
 
-    def _of_other_ranks(self, part: RankPart, most: int) -> Iterator[Terms]:
-        """Take part in the updates that an algorithm of the user makes on other ranks only, until it makes none."""
-        for _ in range(most):
-            terms, makers = self._over_ranks(part, self.no_update(), part.valid.new_zeros(1), makes_update=False)
-            if not makers:
-                return
-            yield terms
-
-    def _of_minibatch(self, losses: MinibatchLosses, bonus: Tensor, *, record: bool) -> tuple[Tensor, ...]:
+    def _of_minibatch(self, losses: MinibatchLosses, bonus: Tensor) -> tuple[Tensor, ...]:
         """Return the gradient [P] and the terms of the losses of a minibatch, by a recording if it is worth one."""
         function, minibatch, _ = losses
-        if not (record and self._records and len(minibatch.shares) <= _MOST_ROWS):
+        if not (self._records and len(minibatch.shares) <= _MOST_ROWS):
             return self._differentiated(function(minibatch, self.forward), bonus)
 
         def gradient(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -146,23 +127,6 @@ class GradientComputer:
         clipped = entropy.new_zeros(()) if losses.clipped_fraction is None else losses.clipped_fraction
         terms = Terms(losses.policy_loss.detach(), value_term.detach(), entropy.detach(), clipped)
         return self.parameters.differentiated(loss), *terms
-
-    def _over_ranks(
-        self, part: RankPart, terms: Terms, shares: Tensor, *, makes_update: bool = True
-    ) -> tuple[Terms, Tensor]:
-        """Replace the gradient of this rank by the mean over all ranks.
-
-        A rank counts by its rows to learn from, so that the result is that of the whole batch.
-
-        Returns: the means of the terms, and the number of ranks that make the update.
-        """
-        number = (shares > 0.0).sum().to(torch.float32)
-        counts = [number, torch.full_like(number, makes_update)]
-        *sums, total, makers = part.ranks.sum(torch.stack([*(each * number for each in terms), *counts]))
-        total = total.clamp(min=1.0)
-        self.parameters.gradients.mul_(number / total)
-        self.parameters.gradients.copy_(part.ranks.sum(self.parameters.gradients))
-        return Terms(*(each / total for each in sums)), makers
 
     def take_first_pass(self) -> FirstPass | None:
         """Return the first pass of the newest batch, once; None without a batch since the last call.

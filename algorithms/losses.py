@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss, mse_loss
 
-from daedalus.algorithms.ranks import ONE_RANK, Ranks
 from daedalus.algorithms.returns import Targets
 
 _ROUNDING = 1e-4  # a deviation below this share of the mean may be only the rounding of float32
@@ -28,26 +27,25 @@ def mean(values: Tensor, shares: Tensor) -> Tensor:
     return values.flatten().dot(shares.flatten())
 
 
-def normalized(advantages: Tensor, valid: Tensor, ranks: Ranks = ONE_RANK) -> Tensor:
-    """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows of all ranks.
+def normalized(advantages: Tensor, valid: Tensor) -> Tensor:
+    """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows.
 
     The deviation is less than 1 where the advantages are equal except for rounding. `valid` [T, B] is 1 or 0.
     """
     # Not by shares, whose rounding would make equal advantages differ from 0.
-    number = ranks.sum(valid.sum()).clamp(min=1.0)
-    average = ranks.sum((advantages * valid).sum()) / number
+    number = valid.sum().clamp(min=1.0)
+    average = (advantages * valid).sum() / number
     centred = advantages - average
-    deviation = (ranks.sum((centred.square() * valid).sum()) / number).sqrt()
+    deviation = ((centred.square() * valid).sum() / number).sqrt()
     return centred / (deviation.maximum(_ROUNDING * average.abs()) + 1e-8)
 
 
-def policy_factors(targets: Targets, valid: Tensor, normalize: bool, ranks: Ranks = ONE_RANK) -> Tensor:
+def policy_factors(targets: Targets, valid: Tensor, normalize: bool) -> Tensor:
     """Return w_t A_t [T, B], the factor of row t in the policy loss, with A_t normalised over the valid rows if asked.
 
     A_t is normalised before it is weighted: normalised after, a row with weight 0 would get -mean / std.
-    `ranks` is that of the batch.
     """
-    return targets.weights * (normalized(targets.advantages, valid, ranks) if normalize else targets.advantages)
+    return targets.weights * (normalized(targets.advantages, valid) if normalize else targets.advantages)
 
 
 def policy_gradient_loss(log_probs: Tensor, factors: Tensor, shares: Tensor) -> Tensor:

@@ -59,8 +59,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
     is split into single rows, and reset rows are omitted. A batch with fewer parts than `count` makes as many
     minibatches as it has parts, so that none is empty. All have one size, that of a batch without reset rows: rows that
-    are missing are filled up by a copy of another row whose share is 0. Of a part of a batch, each minibatch has those
-    of its parts that are in the share; one without any has a part whose shares are 0.
+    are missing are filled up by a copy of another row whose share is 0.
 
     Args:
       log_probs: [T, B], log-probabilities of the actions under the proximal policy.
@@ -75,11 +74,8 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
 def _by_environment(
     batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int
 ) -> Iterator[Minibatch]:
-    whole = batch.valid if batch.rank_part is None else batch.rank_part.valid
-    order = batch.ranks.permutation(whole.shape[1]).to(whole.device)
-    for part in map(partial(_own_environments, batch), order.tensor_split(min(count, len(order)))):
-        valid = batch.valid[:, part] if len(part) else torch.zeros_like(batch.valid[:, :1])
-        part = part if len(part) else part.new_zeros(1)
+    order = torch.randperm(batch.valid.shape[1]).to(batch.valid.device)
+    for part in order.tensor_split(min(count, len(order))):
         yield Minibatch(
             observations=map_components(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
             initial_state=batch.initial_state[part],
@@ -89,24 +85,22 @@ def _by_environment(
             log_probs=log_probs[:, part],
             targets=targets[:, part],
             factors=factors[:, part],
-            shares=shares_of(valid),
+            shares=shares_of(batch.valid[:, part]),
         )
 
 
 def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
-    whole = batch.valid if batch.rank_part is None else batch.rank_part.valid
-    rows = whole.flatten().nonzero().squeeze(1)  # [N]
-    order = rows[batch.ranks.permutation(len(rows)).to(rows.device)]
+    rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
+    order = rows[torch.randperm(len(rows)).to(rows.device)]
     number = min(count, len(order))
     if not number:
         return
-    own = [_own_rows(batch, part) for part in order.tensor_split(number)]
-    counted = [len(part) for part in own]
-    size = 1 if batch.rank_part is not None else -(-whole.numel() // number)
-    own = [_filled_up(part, size) for part in own]
-    order, sizes = torch.cat(own), [len(part) for part in own]
-    shares = {pair: _equal_shares(batch.valid, *pair) for pair in set(zip(counted, sizes, strict=True))}
-    states = {length: batch.initial_state.new_zeros((length, 0)) for length in set(sizes)}
+    split = order.tensor_split(number)
+    size = -(-batch.valid.numel() // number)
+    filled = [_filled_up(part, size) for part in split]
+    order = torch.cat(filled)
+    shares = {length: _equal_shares(batch.valid, length, size) for length in {len(part) for part in split}}
+    state = batch.initial_state.new_zeros((size, 0))
 
     def parts_of(values: Tensor) -> tuple[Tensor, ...]:
         """Gather values of rows [T, B, ...] in the order of the pass, and split them: [1, n, ...] each.
@@ -114,7 +108,7 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
         One gather for each array and pass, and views of it: gathering each minibatch would take as many operations as
         there are minibatches, and small ones cost as much as large ones.
         """
-        return values.flatten(0, 1)[order].unsqueeze(0).split(sizes, dim=1)
+        return values.flatten(0, 1)[order].unsqueeze(0).split(size, dim=1)
 
     # Of images a second copy of the whole batch would be too much.
     large = {name: values for name, values in batch.observations.items() if values[0, 0].nbytes > _LARGE_BYTES}
@@ -122,52 +116,31 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
     actions = {name: parts_of(values) for name, values in batch.actions.items()}
     masks = {name: parts_of(values) for name, values in batch.masks.items()}
     arrays = [parts_of(values) for values in (batch.starts, log_probs, targets, factors)]
-    for index, part in enumerate(own):
+    for index, part in enumerate(filled):
         starts, own_log_probs, own_targets, own_factors = (parts[index] for parts in arrays)
         gathered = map_components(large, partial(_rows, rows=part))
         yield Minibatch(
             observations={name: parts[index] for name, parts in small.items()} | gathered,
-            initial_state=states[sizes[index]],
+            initial_state=state,
             starts=starts,
             actions={name: parts[index] for name, parts in actions.items()},
             masks={name: parts[index] for name, parts in masks.items()},
             log_probs=own_log_probs,
             targets=own_targets,
             factors=own_factors,
-            shares=shares[counted[index], sizes[index]],
+            shares=shares[len(split[index])],
         )
 
 
-def _own_environments(batch: Batch, environments: Tensor) -> Tensor:
-    """Return those of some environments of the whole batch that are in the batch, by their number in the batch."""
-    if batch.rank_part is None:
-        return environments
-    own = environments[(environments >= batch.rank_part.first) & (environments < batch.rank_part.end)]
-    return own - batch.rank_part.first
-
-
-def _own_rows(batch: Batch, rows: Tensor) -> Tensor:
-    """Return those of some rows of the whole batch that are in the batch. Rows are counted as T x B."""
-    if batch.rank_part is None:
-        return rows
-    rank_part, width = batch.rank_part, batch.rank_part.valid.shape[1]
-    environments = rows % width
-    own = (environments >= rank_part.first) & (environments < rank_part.end)
-    return rows[own] // width * (rank_part.end - rank_part.first) + environments[own] - rank_part.first
-
-
 def _filled_up(rows: Tensor, size: int) -> Tensor:
-    """Return the numbers of rows, and copies of the first so that there are at least `size`; row 0 if there is none."""
-    missing = size - len(rows)
-    if missing <= 0:
-        return rows
-    return torch.cat([rows, (rows[:1] if len(rows) else rows.new_zeros(1)).expand(missing)])
+    """Return the numbers of rows, and copies of the first so that there are `size`."""
+    return torch.cat([rows, rows[:1].expand(size - len(rows))])
 
 
 def _equal_shares(like: Tensor, rows: int, size: int) -> Tensor:
     """Return the shares [1, size] of a minibatch whose first rows count, each as much, and the others nothing."""
     shares = like.new_zeros((1, size))
-    shares[:, :rows] = 1.0 / max(rows, 1)
+    shares[:, :rows] = 1.0 / rows
     return shares
 
 

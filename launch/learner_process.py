@@ -17,8 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.policy.network.errors import NetworkError
-
 from daedalus.algorithms.errors import AlgorithmError
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.confirmation import Confirmations
@@ -46,7 +44,7 @@ from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_modules import UserModules, allow_settings, allow_words, modules_of, shown_path
+from daedalus.policy.user_modules import NetworkError, UserModules, allow_settings, allow_words, modules_of, shown_path
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.addresses import reachable

@@ -4,10 +4,11 @@ import shlex
 import subprocess
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from daedalus.launch.logs import LogOptions
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spaces import Spaces
@@ -69,13 +70,11 @@ class LocalRun:
     reset_statistics: bool = False  # of the checkpoint to resume from
     trained: int | None = None  # exit status of a run that is already trained and that only lacks its evaluation
     spaces: Spaces | None = None  # of the environment, if it was checked
-    processes: int = 1  # of the learner
     init_from: Path | None = None  # another run, whose weights the learner begins with
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
     insecure: bool = False
-    log_level: str = "info"  # of the learner and the evaluation; actors log warnings, or everything at "debug"
-    log_json: bool = False
+    logs: LogOptions = field(default_factory=LogOptions)  # of the learner and the evaluation; others log warnings
     watch: bool = False  # start a gateway with the page of the run
     camera: bool = True  # with a camera
     clients: bool = False  # with the page, let clients take part
@@ -112,12 +111,10 @@ def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
         arguments += ["--tls", str(run.tls)]
     if run.insecure:
         arguments.append("--insecure")
-    arguments += ["--started", repr(since), *_logging(run.log_level, run.log_json), *run.observer.learner_options]
+    arguments += ["--started", repr(since), *run.logs.words(), *run.observer.learner_options]
     arguments += allow_settings(run.spec.learner_modules)
     if run.spaces is not None:
         arguments += ["--spaces", run.spaces.model_dump_json()]
-    if run.processes > 1:
-        arguments += ["--processes", str(run.processes)]
     if run.init_from is not None:
         arguments += ["--init-from", str(run.init_from)]
     if run.spec.training.target_return is not None:
@@ -132,23 +129,22 @@ def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
 def actor_arguments(run: LocalRun) -> tuple[str, ...]:
     """Return the arguments of this machine's actors and of the evaluator."""
     # The learner reports the progress of all actors: the records of each one are for debugging.
-    level = "debug" if run.log_level == "debug" else "warning"
-    return *_logging(level, run.log_json), *allow_settings(run.spec.actor_modules)
+    return *_of_helpers(run.logs), *allow_settings(run.spec.actor_modules)
 
 
 def evaluation_arguments(run: LocalRun) -> list[str]:
     """Return the arguments of every `daedalus evaluate`."""
-    return [*_logging(run.log_level, run.log_json), *allow_settings(run.spec.environment.user_modules)]
+    return [*run.logs.words(), *allow_settings(run.spec.environment.user_modules)]
 
 
 def gateway_arguments(run: LocalRun) -> tuple[str, ...]:
     """Return the arguments of the gateway with the page."""
-    level = "debug" if run.log_level == "debug" else "warning"  # it prints its address at any level
     filming = [*allow_settings(run.spec.user_modules), "--checkpoints", str(run.directory)]
     camera = filming if run.camera else ["--no-camera"]
     token = ("--operator-token", str(run.directory / run_directory.OPERATOR_TOKEN))
-    return *_logging(level, run.log_json), *token, *camera, *([] if run.clients else ["--page-only"])
+    return *_of_helpers(run.logs), *token, *camera, *([] if run.clients else ["--page-only"])
 
 
-def _logging(level: str, as_json: bool) -> tuple[str, ...]:
-    return "--log-level", level, *(["--log-json"] if as_json else [])
+def _of_helpers(logs: LogOptions) -> list[str]:
+    """Return the options of actors and of the gateway, which prints its address at any level."""
+    return replace(logs, level="debug" if logs.level == "debug" else "warning").words()

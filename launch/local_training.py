@@ -192,7 +192,7 @@ def run_locally(
     Raises RunFailedError or RunStoppedError.
     """
     page: list[Supervised] = []
-    trackers = TrackerProcesses(run.log, run.directory, output, log_json=run.log_json)
+    trackers = TrackerProcesses(run.log, run.directory, output, log_json=run.logs.as_json)
     try:
         if run.trained is None:
             status = train(run, stopping, output, learner_streams, page, trackers)

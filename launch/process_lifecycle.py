@@ -27,7 +27,6 @@ FAILED, BAD_USAGE = 1, 2
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
 STOPPED = 128 + signal.SIGTERM
 ORDERED = 4  # exit status of a supervised learner that an operator stopped
-RANK_LOST = 5  # exit status of a process of a learner that has lost another one; restarted, it goes on
 UNSAVED = 6  # exit status of a supervised learner whose last checkpoint could not be saved
 SUPERSEDED = 7  # exit status of a learner that a newer one of its run has replaced: it must not be started again
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal

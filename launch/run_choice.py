@@ -72,9 +72,8 @@ class RunChoice:
 
         A repeated config.toml of another run has no name of its own.
         """
-        preset = self.preset
-        unnamed = preset is None or Path(preset).name == run_directory.CONFIG
-        return run_directory.default_directory(spec.environment.id if unnamed else Path(preset).stem, spec)
+        named = self.preset is not None and Path(self.preset).name != run_directory.CONFIG
+        return run_directory.default_directory(Path(self.preset or "").stem if named else spec.environment.id, spec)
 
     def _applied(self, settings: dict[str, Any]) -> dict[str, Any]:
         """Return settings after the choices, which change them in place. Raises SettingsError."""

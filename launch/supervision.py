@@ -10,11 +10,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from daedalus.launch.child_output import OpenStreams, Streams, inherited
-from daedalus.launch.process_lifecycle import RANK_LOST, STOPPED, interrupts_held
+from daedalus.launch.process_lifecycle import STOPPED, interrupts_held
 
 GATEWAY = "gateway"  # name of its process
-# Exit statuses that mean something for a learner only.
-_LEARNERS_RESTARTS = {STOPPED: "was stopped by a signal", RANK_LOST: "lost one of its processes"}
+# Exit status that means something for a learner only.
+_LEARNERS_RESTARTS = {STOPPED: "was stopped by a signal"}
 # Signals of a process that crashes by itself. Others come from outside: an operator, or the system.
 _CRASHES = {
     getattr(signal, name)

@@ -8,8 +8,6 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
-from numbers import Integral
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -19,11 +17,10 @@ from daedalus.launch.environment_check import EnvironmentProblemError
 from daedalus.launch.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError
 from daedalus.launch.local_training import run_locally
 from daedalus.launch.logs import LineHandler, say
-from daedalus.launch.run_choice import Choice, named_directory, prepare
+from daedalus.launch.run_choice import NewRun, RunChoice, create_run
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.initial import check_initial
-from daedalus.learner.run.settings import SettingsError, assign
+from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import refuse_while_imported
 
 _KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
@@ -68,7 +65,6 @@ def train(
     wrap: str | None = None,
     init_from: str | Path | None = None,
     allow_other_spaces: bool = False,
-    processes: int = 1,
     callback: Callback | None = None,
     log: str | Sequence[str] = (),
     quiet: bool = False,
@@ -91,7 +87,6 @@ def train(
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
       init_from: another run, or one of its checkpoints, whose weights to begin with, of equal network and spaces.
       allow_other_spaces: accept `init_from` of other spaces: the weights are loaded if their shapes fit.
-      processes: of the learner; each computes the gradients of its share of every batch.
       callback: called with each row of metrics; it can log metrics of its own and end training.
       log: trackers to log the run to, of "wandb", "mlflow" and "trackio".
       quiet: print nothing.
@@ -102,43 +97,44 @@ def train(
     started = time.monotonic()
     refuse_while_imported("daedalus.train")
     preset = str(preset) if isinstance(preset, Path) else preset
-    _check_types(preset, env, callback, settings, processes)
+    _check_types(preset, env, callback, settings)
     log = (log,) if isinstance(log, str) else log
     if unknown := set(log) - set(TRACKERS):
         raise SettingsError(f"log: unknown tracker {sorted(unknown)[0]!r}: choose from {', '.join(TRACKERS)}")
-    choice = Choice(
-        preset=preset, env=env, algorithm=algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap
+    choice = RunChoice(
+        preset=preset,
+        env=env,
+        algorithm=algorithm,
+        seed=seed,
+        env_steps=env_steps,
+        actors=actors,
+        wrap=wrap,
+        settings=settings or {},
     )
-    resolved = partial(choice.spec, partial(_assign, changes=settings or {}))
-    weights = None if init_from is None else Path(init_from)
-    check_initial(weights, other_spaces=allow_other_spaces)
-    if run_dir is not None:
-        run_directory.check_free(Path(run_dir))  # before the environment is made
+    new = NewRun(
+        choice=choice,
+        directory=None if run_dir is None else Path(run_dir),
+        init_from=None if init_from is None else Path(init_from),
+        other_spaces=allow_other_spaces,
+    )
     with _checking(quiet):
-        spec, spaces = prepare(resolved, env=env, processes=int(processes))
-    directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    with (
-        run_directory.create_locked(
-            directory, spec, numbered=run_dir is None, init_from=weights, other_spaces=allow_other_spaces
-        ) as lock,
-        observed(callback, lock.directory) as (observer, control),
-    ):
+        lock, spec, spaces = create_run(new)
+    with lock, observed(callback, lock.directory) as (observer, control):
         run = LocalRun(
             directory=lock.directory,
             spec=spec,
             started=started,
             lock=lock.inheritable,
             spaces=spaces,
-            init_from=weights,
+            init_from=new.init_from,
             log=tuple(log),
-            processes=processes,
             observer=observer,
         )
         end = _run(run, quiet)
     return _result(lock.directory, end, control.stop_reason)
 
 
-def _check_types(preset: object, env: object, callback: object, settings: object, processes: object) -> None:
+def _check_types(preset: object, env: object, callback: object, settings: object) -> None:
     """Raise TypeError for objects that are often given in place of a name, or of an instance."""
     for name in (preset, env):
         if not isinstance(name, str | None):
@@ -147,16 +143,6 @@ def _check_types(preset: object, env: object, callback: object, settings: object
         raise TypeError(f"callback must be an instance of a subclass of daedalus.Callback, not {callback}")
     if not isinstance(settings, Mapping | None) or not all(isinstance(path, str) for path in settings or ()):
         raise TypeError(f'settings must be a map such as {{"training.learning_rate": 0.001}}, not {settings!r}')
-    if not isinstance(processes, Integral):
-        raise TypeError(f"processes must be a whole number, not {processes!r}")
-
-
-def _assign(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
-    for path, value in changes.items():
-        try:
-            assign(settings, path, value)
-        except SettingsError as error:
-            raise SettingsError(f"settings {path!r}: {error}") from None
 
 
 @contextmanager

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.learner.ranks.errors import RankLostError
-from daedalus.learner.ranks.opening import OpenRanks, no_other_ranks
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.run_records import RunRecords, continue_records
@@ -37,7 +35,6 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:
-    from daedalus.learner.ranks.leader import OtherRanks
     from daedalus.learner.training.checkpoint import Checkpoint
     from daedalus.learner.training.checkpointer import Checkpointer
     from daedalus.learner.training.learner import Learner
@@ -81,7 +78,6 @@ class LearnerService:
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
         user_metrics: UserMetrics | None = None,
-        open_ranks: OpenRanks = no_other_ranks,
         confirms: bool = False,
         reset_statistics: bool = False,
     ) -> None:
@@ -102,16 +98,14 @@ class LearnerService:
           modules: modules that may be imported for the policy.
           certificate_days_left: function that returns the days until the certificate of this process expires.
           user_metrics: metrics of the program that started the run.
-          open_ranks: connects the other processes of the learner.
           confirms: whether a launcher plays new episodes to confirm that the target is reached.
           reset_statistics: whether to forget the running statistics of the checkpoint.
         """
         self._spec, self._stop, self._progress = spec, stop, progress
-        self._open_writers, self._modules, self._open_ranks = open_writers, modules, open_ranks
+        self._open_writers, self._modules = open_writers, modules
         self._restored, self._initial = restored, initial if restored is None else None
         self._allows_other_spaces = other_spaces
         self._reset_statistics = reset_statistics
-        self._ranks: OtherRanks | None = None  # None: not connected yet
         starts_before = restored.counters.get("starts", 0) if restored is not None else 0
         self._state = RunState(directory, spec, started, certificate_days_left, starts_before)
         if restored is not None:
@@ -131,7 +125,9 @@ class LearnerService:
         )
         self._confirmation = None
         if confirms and spec.training.stop_when_solved:
-            self._confirmation = TargetConfirmation(self._state, server.events, stop, lock=server.lock, beat=self._beat)
+            self._confirmation = TargetConfirmation(
+                self._state, server.events, stop, lock=server.lock, beat=self._heartbeat.beat
+            )
         self._reporter = RunReporter(self._state, server.fleet, server.lock, user_metrics or UserMetrics())
 
     @property
@@ -145,8 +141,7 @@ class LearnerService:
         Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
         learner serves the run, CheckpointMismatchError if a checkpoint does not fit the settings, NetworkError if
         the policy or the algorithm does not support the spaces, SettingsError if the device is not available or
-        rollouts are too short for masked actions, RankLostError or RanksDisagreeError of the other processes of the
-        learner.
+        rollouts are too short for masked actions.
         """
         self._heartbeat.start()
         try:
@@ -155,40 +150,26 @@ class LearnerService:
             continue_records(self._state, version, self._server.history, self._server.events)
             from daedalus.learner.training.learner import Learner
 
-            self._ranks = ranks = self._open_ranks(self._spec, self._stop)
-            if ranks is None or (self._server.fleet.spaces is None and not self._await_actor()):
+            if self._server.fleet.spaces is None and not self._await_actor():
                 return self._stopped_without_actors()
             spaces = self._server.fleet.spaces
             assert spaces is not None
             check_rollout_length(self._spec, spaces)
-            learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules, ranks)
+            learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
             self._load(learner, spaces)
             checkpointer, loop = self._training_of(learner, spaces)
             if self._initial is not None:
                 checkpointer.begin()  # a learner that is killed before its first checkpoint continues from this one
-            ranks.begin(spaces, learner.shared_state)
             if self._restored is None and not self._await_actor():
                 return self._stopped_without_actors()
             return self._learn(learner, checkpointer, loop)
-        except RankLostError:
-            if not self._stop.is_set():  # a signal may end all processes of the learner at once
-                raise
-            return self._stopped_without_actors()
         finally:
             self._server.close(_STOPPED)  # unless it is closed
             self._heartbeat.clear()
-            if self._ranks is not None:
-                self._ranks.close()
 
     def _await_actor(self) -> bool:
         """Wait until an actor has joined, and return whether one has; False if the run is stopped first."""
-        return self._server.await_actor(self._stop, self._beat)
-
-    def _beat(self) -> None:
-        """Show the supervisor and the other ranks that this process works."""
-        self._heartbeat.beat()
-        if self._ranks is not None:
-            self._ranks.wait()
+        return self._server.await_actor(self._stop, self._heartbeat.beat)
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
@@ -253,7 +234,7 @@ class LearnerService:
             orders=self._orders,
             confirmation=self._confirmation,
             stop=self._stop,
-            beat=self._beat,
+            beat=self._heartbeat.beat,
         )
         loop.publish(program)
         return checkpointer, loop
@@ -271,9 +252,6 @@ class LearnerService:
         try:
             ended = loop.run(records, resumed=self._restored is not None)
             finished = state.is_finished
-        except RankLostError:
-            if not self._stop.is_set():  # a signal may end all processes of the learner at once
-                raise
         finally:
             ended = ended or time.monotonic()
             try:

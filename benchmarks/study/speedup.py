@@ -39,9 +39,8 @@ from benchmarks.study.simulated_actors import train_simulated
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.comparing.comparison import estimate
 from daedalus.cli.comparing.tables import written
-from daedalus.launch.run_choice import Choice
+from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
-from daedalus.learner.run.settings import override
 from daedalus.protocol.spec import EnvironmentSpec
 
 _IDENTITY = ("task", "method", "actors", "seed", "milliseconds")
@@ -101,16 +100,15 @@ def simulate(run: Mapping[str, Any]) -> dict[str, Any]:
     task, (algorithm, _) = TASKS[run["task"]], METHODS[run["method"]]
     environments = make_environments(EnvironmentSpec(id=task.id), 1)
     environments.close()
-    choice = Choice(
-        preset=None,
+    choice = RunChoice(
         env=task.id,
         algorithm=algorithm,
         seed=run["seed"],
         env_steps=task.env_steps,
         actors=run["actors"],
-        wrap=None,
+        assignments=changes(run),
     )
-    spec = choice.spec(lambda settings: override(settings, changes(run)), default_settings(environments.spaces))
+    spec = choice.spec(default_settings(environments.spaces))
     learner, seconds = train_simulated(spec, run["milliseconds"] / 1000)
     if learner.env_steps_to_target is None:
         return {"seconds": "", "env_steps": ""}

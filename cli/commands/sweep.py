@@ -11,7 +11,7 @@ from pathlib import Path
 import tomli_w
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
+from daedalus.cli.settings_arguments import add_log, add_settings, run_choice
 from daedalus.cli.sweeping.axes import Axis, Choices, read_axis
 from daedalus.cli.sweeping.display import Display
 from daedalus.cli.sweeping.plan import Planner
@@ -154,13 +154,14 @@ def _search(parsed: argparse.Namespace, axes: Sequence[Axis], folder: Path) -> S
     """
     if parsed.sampler:
         import_optuna()  # before the check, which takes seconds
-    spec, defaults = resolve_spec(parsed), None
+    choice, defaults = run_choice(parsed), None
+    spec = choice.spec()
     if parsed.env is None:
         checked_spaces(spec, fork=True)
     else:
         _, defaults = checked_defaults(spec, fork=True)
-    first = resolve_spec(parsed, defaults).training.seed
-    seeds, planner = range(first, first + parsed.seeds), Planner(parsed, folder, defaults)
+    first = choice.spec(defaults).training.seed
+    seeds, planner = range(first, first + parsed.seeds), Planner(choice, parsed.log, folder, defaults)
     if parsed.sampler:
         return SampledSearch(planner, axes, seeds, trials=parsed.trials or 20, folder=folder)
     return GridSearch(planner, [axis for axis in axes if isinstance(axis, Choices)], seeds)

@@ -1,15 +1,13 @@
 """The runs of a sweep: their names, settings and command lines, and how far each one is. No processes."""
 
-import argparse
-import copy
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.settings_arguments import resolve_spec
+from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import allow_settings
@@ -45,9 +43,11 @@ class PlannedRun:
 class Planner:
     """Planner of runs in one folder, from the options that `daedalus sweep` shares with `daedalus train`."""
 
-    def __init__(self, parsed: argparse.Namespace, folder: Path, defaults: dict[str, Any] | None = None) -> None:
-        """Construct the planner. See settings_arguments.resolve for `defaults`."""
-        self._parsed, self._folder, self._defaults = parsed, folder, defaults
+    def __init__(
+        self, choice: RunChoice, trackers: Sequence[str], folder: Path, defaults: dict[str, Any] | None = None
+    ) -> None:
+        """Construct the planner. See RunChoice.spec for `defaults`."""
+        self._choice, self._trackers, self._folder, self._defaults = choice, trackers, folder, defaults
 
     def runs(self, name: str, point: Point, seeds: Sequence[int]) -> list[PlannedRun]:
         """Return the runs of a point, one for each seed.
@@ -56,32 +56,30 @@ class Planner:
         """
         runs = []
         for seed in seeds:
-            options = _with_point(self._parsed, point, seed)
+            choice = _with_point(self._choice, point, seed)
             own = f"{name}_seed-{seed}" if name else f"seed-{seed}"
             directory = self._folder / own
-            spec = resolve_spec(options, self._defaults)
-            words = (*_words(options), "--run-dir", str(directory))
+            spec = choice.spec(self._defaults)
+            words = (*_words(choice, self._trackers), "--run-dir", str(directory))
             run = PlannedRun(name=own, point=point, seed=seed, directory=directory, spec=spec, words=words)
             _check_same(run)
             runs.append(run)
         return runs
 
 
-def _with_point(parsed: argparse.Namespace, point: Point, seed: int) -> argparse.Namespace:
-    """Return the options with the settings of a point."""
-    options = copy.copy(parsed)
-    options.seed = seed
-    options.set = [*parsed.set, *(f"{key}={value}" for key, value in point.items())]
-    return options
+def _with_point(choice: RunChoice, point: Point, seed: int) -> RunChoice:
+    """Return the choice with the settings of a point."""
+    assignments = (*choice.assignments, *(f"{key}={value}" for key, value in point.items()))
+    return replace(choice, seed=seed, assignments=assignments)
 
 
-def _words(options: argparse.Namespace) -> list[str]:
-    words = ["train", *([options.preset] if options.preset is not None else [])]
+def _words(choice: RunChoice, trackers: Sequence[str]) -> list[str]:
+    words = ["train", *([choice.preset] if choice.preset is not None else [])]
     for name in ("env", "algorithm", "actors", "seed", "env_steps", "wrap"):
-        value = getattr(options, name)
+        value = getattr(choice, name)
         words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
-    words += [word for tracker in options.log for word in ("--log", tracker)]
-    return [*words, *(word for assignment in options.set for word in ("--set", assignment))]
+    words += [word for tracker in trackers for word in ("--log", tracker)]
+    return [*words, *(word for assignment in choice.assignments for word in ("--set", assignment))]
 
 
 def point_name(point: Point) -> str:

@@ -23,7 +23,6 @@ from daedalus.algorithms.normalization import (
     observations_name,
     one,
 )
-from daedalus.learner.ranks.leader import NO_OTHER_RANKS, OtherRanks
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.run.updates import updates_of
 from daedalus.learner.training.errors import CheckpointMismatchError
@@ -61,7 +60,6 @@ class Learner:
         policy: PolicySpec,
         spaces: Spaces,
         modules: UserModules = NO_MODULES,
-        other_ranks: OtherRanks = NO_OTHER_RANKS,
     ) -> None:
         """Construct the learner at policy version 0, with parameters initialised from `spec.seed`.
 
@@ -70,7 +68,6 @@ class Learner:
           policy: settings of the network.
           spaces: components of observations and actions.
           modules: may be imported for the policy.
-          other_ranks: other processes that compute parts of each batch.
 
         Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces,
         AlgorithmError if the algorithm of the user cannot be used.
@@ -83,7 +80,6 @@ class Learner:
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
         self._spec, self._spaces = spec, spaces
-        self._other_ranks = other_ranks
         self.device = torch.device(spec.device)
         self._network = ActorCritic(policy, spaces, modules, spec).to(self.device)
         self._gradients = GradientComputer(spec, self._network, spaces, modules)
@@ -183,35 +179,17 @@ class Learner:
 
     def _make_updates(self, batch: Batch, progress: float, end: int) -> bool:
         """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
-        part = self._other_ranks.part(batch, self.constants, self.policy_version, end, progress)
-        if not self.learn_from(part, progress, end):
-            return False
-        if self.first_pass is not None:
-            self.first_pass = self._other_ranks.collect(self.first_pass)
-            self.metrics.add_batch_metrics(batch_metrics(self.first_pass))
-        self.metrics.add_batch(batch)
-        return True
-
-    def learn_from(self, batch: Batch, progress: float, end: int) -> bool:
-        """Make updates until policy version `end`. Return False at the first whose gradient is not finite.
-
-        Args:
-          batch: in main memory, with normalised rewards; a whole batch or a share.
-          progress: as for `step`.
-          end: policy version after the last update.
-        """
         self.first_pass = None  # its memory is used for this batch
-        batch = batch.to(self.device)
-        for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
+        for terms in self._gradients.compute(batch.to(self.device), self.entropy_bonus(progress)):
             if not self._make_update(terms, progress):
                 return False
             if self.policy_version == end:
                 break
         self.policy_version = end  # an algorithm of the user may stop early
-        first_pass = self._gradients.take_first_pass()
-        # An algorithm of the user may make no update on some ranks: then the whole batch has no first pass.
-        if batch.rank_part is None or batch.rank_part.all_have(first_pass):
-            self.first_pass = first_pass
+        self.first_pass = self._gradients.take_first_pass()
+        if self.first_pass is not None:  # an algorithm of the user may make no update
+            self.metrics.add_batch_metrics(batch_metrics(self.first_pass))
+        self.metrics.add_batch(batch)
         return True
 
     def _make_update(self, terms: Terms, progress: float) -> bool:
@@ -342,15 +320,6 @@ class Learner:
     def state(self) -> dict[str, Tensor]:
         """Return the training state besides the parameters: optimiser and running statistics, random state."""
         return {"torch_random_state": torch.get_rng_state(), **self._statistics()}
-
-    @property
-    def constants(self) -> list[Tensor]:
-        """Parameters that no gradient changes, such as the statistics of observations."""
-        return [parameter for parameter in self._parameters.values() if not parameter.requires_grad]
-
-    def shared_state(self) -> list[Tensor]:
-        """Return all tensors that updates depend on, in an order that is the same in all processes of a learner."""
-        return [*self._parameters.values(), *self._statistics().values()]
 
     def _statistics(self) -> dict[str, Tensor]:
         statistics = {f"{self._spec.optimizer}/{name}": value for name, value in self._optimizer.statistics.items()}

@@ -9,7 +9,7 @@ from log_lines import LINES
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError, NoLearnerError
-from daedalus.cli.commands import actor
+from daedalus.launch import actor_process
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.transport.credentials import CredentialsError, NotValidNowError
 from daedalus.transport.interface import RefusedError, TransportError, UnreachableError
@@ -81,7 +81,7 @@ def test_the_time_that_the_user_set_ends_a_standing_actor(
 
 
 def test_a_fault_of_ours_is_no_cause_of_others(script: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not actor._is_of_others(ZeroDivisionError())
+    assert not actor_process._is_of_others(ZeroDivisionError())
 
 
 @pytest.mark.parametrize(("stays", "status"), [(False, 1), (True, 0)])

@@ -1,6 +1,5 @@
 """Test of launch/supervision.py: the processes of `daedalus train`."""
 
-import argparse
 import os
 import subprocess
 import sys
@@ -12,13 +11,12 @@ from typing import Any
 import pytest
 from processes import LIMIT, until
 
-from daedalus.cli import supervised_learner
 from daedalus.launch import supervision
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.confirmation import Confirmations
 from daedalus.launch.local_run import LocalRun, RunObserver
 from daedalus.launch.local_training import watch
-from daedalus.launch.process_lifecycle import RANK_LOST, STOPPED, UNSAVED
+from daedalus.launch.process_lifecycle import STOPPED, UNSAVED
 from daedalus.launch.supervision import FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
@@ -103,10 +101,9 @@ def test_a_crash_long_after_the_start_does_not_add_up(monkeypatch: pytest.Monkey
     stop([process.process])
 
 
-@pytest.mark.parametrize("status", [STOPPED, RANK_LOST])
-def test_statuses_of_a_learner_are_failures_of_another_process(status: int) -> None:
-    process = supervised(f"raise SystemExit({status})", no_fault={})
-    assert [message(process), message(process)] == [f"worker failed with status {status}; started again"] * 2
+def test_the_status_of_a_stopped_learner_is_a_failure_of_another_process() -> None:
+    process = supervised(f"raise SystemExit({STOPPED})", no_fault={})
+    assert [message(process), message(process)] == [f"worker failed with status {STOPPED}; started again"] * 2
     with pytest.raises(FailedError, match="worker failed 3 times"):
         message(process)
     stop([process.process])
@@ -220,29 +217,3 @@ def test_training_that_a_callback_ended_is_not_evaluated_if_its_last_checkpoint_
         assert watch(learner, [], run, threading.Event(), confirmations) == UNSAVED
     finally:
         stop([learner.process])
-
-
-def test_a_learner_of_several_processes_is_not_restarted_if_its_last_checkpoint_could_not_be_saved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    started = []
-
-    def begin(*_: object, **_others: object) -> subprocess.Popen[bytes]:
-        started.append(subprocess.Popen([sys.executable, "-S", "-c", f"raise SystemExit({UNSAVED})"]))
-        return started[-1]
-
-    monkeypatch.setattr(supervised_learner, "start", begin)
-    arguments = argparse.Namespace(log_level="info", log_json=False, run_dir=tmp_path)
-    assert supervised_learner.supervise_learner(tmp_path, arguments, threading.Event()) == 1
-    assert len(started) == 1
-
-
-def test_a_learner_that_has_lost_one_of_its_processes_is_restarted_and_has_not_failed() -> None:
-    process = supervised(f"import sys; sys.argv[1] == 'True' and sys.exit({RANK_LOST}); {SLEEP}")
-    try:
-        process.process.wait(LIMIT)
-        assert not process.failed_at_once
-        assert message(process) == "worker lost one of its processes; started again"
-        assert (process.restarts, process.failures) == (1, 0)
-    finally:
-        stop([process.process])

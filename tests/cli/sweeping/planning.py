@@ -6,12 +6,14 @@ from pathlib import Path
 from recorded_runs import record
 
 from daedalus.cli.commands.sweep import parser
+from daedalus.cli.settings_arguments import run_choice
 from daedalus.cli.sweeping.plan import PlannedRun, Planner
 from daedalus.learner.run.run_directory import SUMMARY, read_json, write_config
 
 
 def planner(folder: Path, *options: str) -> Planner:
-    return Planner(parser().parse_args(["cartpole", *options]), folder)
+    parsed = parser().parse_args(["cartpole", *options])
+    return Planner(run_choice(parsed), parsed.log, folder)
 
 
 def finish(run: PlannedRun, *, evaluation: float = 490.0, solved: bool = False, env_steps: int = 3000) -> None:
