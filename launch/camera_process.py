@@ -17,7 +17,6 @@ import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
-from daedalus.cli.arguments import add_allow_module
 from daedalus.gateway.watching.camera import LENGTH, frame, note
 from daedalus.launch.logs import configure_logging
 from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, stop_on_signals
@@ -142,7 +141,7 @@ class _Output:
 def main(output: BinaryIO) -> int:
     """Play until the gateway closes standard input, and return the exit status."""
     options = argparse.ArgumentParser(description=__doc__)
-    add_allow_module(options, "the run")
+    options.add_argument("--allow-module", action="append", default=[])
     options.add_argument("--checkpoints", type=Path, help="run directory, for value estimates")
     arguments = options.parse_args()
     if arguments.checkpoints is not None:  # the environment may change the working directory

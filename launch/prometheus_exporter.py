@@ -1,10 +1,11 @@
-"""Conversion of a learner's status to Prometheus metrics. Pure functions.
+"""The process of `daedalus exporter`: a learner's status as Prometheus metrics, and the HTTP server for them.
 
 A counter that a learner restores from a checkpoint goes back a little. Prometheus interprets this as a restart from 0,
 so `rate` shows a peak of the whole count. Rates that the dashboard draws are therefore also exported as gauges.
 """
 
 import contextlib
+import logging
 import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -15,8 +16,22 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
+from daedalus.launch.logs import print_error
+from daedalus.launch.process_lifecycle import FAILED
+from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, RunStatus
-from daedalus.transport.status_query import newest_of_each_run
+from daedalus.transport.connecting import connect_with_retry
+from daedalus.transport.credentials import Credentials
+from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.retries import Retries
+from daedalus.transport.slow_calls import SlowCall
+from daedalus.transport.status_query import ask, newest_of_each_run
+
+_logger = logging.getLogger(__name__)
+
+_MAX_ACTORS = 1000  # of a run with series of their own
+_REOPEN_SECONDS = 10.0  # after this time without an answer, a new session replaces the old one
+
 
 _QUIET_SECONDS = 10.0  # a connection that sends or takes nothing for as long is ended
 _MAX_CONNECTIONS = 64  # each has a thread
@@ -212,3 +227,94 @@ def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
 
 def _states(run: RunStatus) -> dict[str, int]:
     return {"alive": run.actors_alive, "quarantined": run.actors_quarantined, "gone": run.actors_gone}
+
+
+class StatusCollector:
+    """Collector that queries the learners at each scrape. The timeout of the query bounds the time of a scrape."""
+
+    def __init__(self) -> None:
+        self.transport: Transport | None = None  # None until a router answers
+        self.unanswered = False  # whether no learner answered the last scrape
+        self._warned = False  # that not all actors have series
+
+    def collect(self) -> Iterator[Metric]:
+        """Query the learners and return their metrics."""
+        statuses = []
+        if self.transport is not None:
+            with contextlib.suppress(TransportError, ProtocolError):
+                statuses = ask(self.transport, max_actors=_MAX_ACTORS)
+        self.unanswered = not statuses
+        self._warn_of_large_fleet(statuses)
+        return metrics(statuses)
+
+    def _warn_of_large_fleet(self, statuses: list[RunStatus]) -> None:
+        """Warn once if not all actors have series of their own."""
+        for status in statuses:
+            if status.fleet_size > len(status.actors) and not self._warned:
+                self._warned = True
+                _logger.warning(
+                    "run %r has %d actors: %d of them have metrics of their own; those of the run are over all",
+                    status.run,
+                    status.fleet_size,
+                    len(status.actors),
+                )
+
+    def describe(self) -> list[Metric]:
+        """Return nothing, so that the registry does not query the learners to find the metrics."""
+        return []
+
+
+def serve_metrics(
+    listener: tuple[str, int], endpoints: list[str], credentials: Credentials | None, stop: threading.Event
+) -> int:
+    """Serve the status of the learners at a host and port until `stop` is set, and return the exit status."""
+    host, port = listener
+    collector, registry = StatusCollector(), CollectorRegistry()
+    registry.register(collector)
+    try:
+        server = MetricsServer(host, port, registry)
+    except OSError as error:
+        print_error("exporter", f"cannot listen on {host}:{port}: {error.strerror}: choose another --listen")
+        return FAILED
+    thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread.start()
+    _logger.info("serving http://%s:%d/metrics", host, server.server_port)
+    try:
+        _follow(collector, endpoints, credentials, stop)
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+    return 0
+
+
+def _follow(
+    collector: StatusCollector, endpoints: list[str], credentials: Credentials | None, stop: threading.Event
+) -> None:
+    """Keep the collector connected until a signal."""
+
+    def check() -> None:
+        if stop.is_set():
+            raise TransportError("stopped")
+
+    retries = Retries(stop)
+    while True:
+        try:
+            transport = connect_with_retry(endpoints, stop, credentials=credentials)
+        except TransportError as error:  # a certificate is refused, perhaps until somebody renews one
+            if retries.wait(str(error)):
+                return
+            continue
+        if transport is None:
+            return
+        break
+    collector.transport = transport
+    try:
+        while not stop.wait(_REOPEN_SECONDS):
+            if collector.unanswered:
+                # Zenoh reconnects by itself, except if the connection died without an error.
+                with contextlib.suppress(TransportError):
+                    SlowCall(transport.reopen).wait(check)
+    finally:
+        collector.transport = None
+        transport.close()

@@ -7,7 +7,6 @@ import signal
 import sys
 from contextlib import suppress
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from daedalus.cli.arguments import (
     log_options,
     whole_number,
 )
-from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
 from daedalus.cli.screen import Screen, TrainingDisplay
 from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, new_run
 from daedalus.launch.child_output import ChildOutput, inherited
@@ -254,7 +252,11 @@ def _check_watching(parsed: argparse.Namespace) -> None:
     """Raise SettingsError if the gateway's packages are missing, or there is no gateway."""
     if parsed.clients and not parsed.watch:
         raise SettingsError("--clients is for the page of the run: add --watch, or start `daedalus gateway`")
-    if parsed.watch and not all(map(find_spec, GATEWAY_PACKAGES)):
+    if not parsed.watch:
+        return
+    from daedalus.launch.gateway_process import GATEWAY_PACKAGES, INSTALL  # with what a gateway imports
+
+    if not all(map(importlib.util.find_spec, GATEWAY_PACKAGES)):
         raise SettingsError(f"--watch: {INSTALL}")
 
 

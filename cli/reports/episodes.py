@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from daedalus.cli.comparing.comparison import Estimate
-from daedalus.cli.comparing.statistics import interquartile_mean, mean_interval, stratified_bootstrap
+from daedalus.cli.comparing.statistics import interquartile_mean, stratified_bootstrap
 from daedalus.cli.reports.run_record import RecordedEvaluation
+from daedalus.launch.confirmation import mean_interval
 
 _REPETITIONS = 2000
 _MOST_VALUES = 4_000_000  # that the bootstrap draws in all, to limit its memory and its time

@@ -11,10 +11,9 @@ import pytest
 from processes import until
 
 from daedalus.cli.commands.evaluate import parser
-from daedalus.cli.comparing.statistics import mean_interval
 from daedalus.launch import confirmation as module
 from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.confirmation import Confirmations, confirmation, confirmation_arguments
+from daedalus.launch.confirmation import Confirmations, confirmation, confirmation_arguments, mean_interval
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
