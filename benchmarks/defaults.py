@@ -30,8 +30,7 @@ import numpy as np
 
 from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import machine, table, train
-from daedalus.cli.comparing.comparison import estimate, improvement
-from daedalus.cli.comparing.tables import written
+from daedalus.analysis.comparison import estimate, improvement, written
 
 _PEER = Path(__file__).parent / "peer_ppo.py"
 _IDENTITY, _RESULTS = ("environment", "env_steps", "seed", "trainer"), ("score", "seconds", "cpu_seconds")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from daedalus.actor.environments.environment_errors import EnvironmentSetupError
     from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
     from daedalus.actor.evaluation.video import VideoError
-    from daedalus.cli.comparing.recorded_run import read_metrics
+    from daedalus.analysis.recorded_run import read_metrics
     from daedalus.launch.callbacks import Callback, TrainingRun
     from daedalus.launch.evaluation import EvaluationResult, evaluate
     from daedalus.launch.train_function import RunResult, TrainingError, train
@@ -58,7 +58,7 @@ _MODULES = {
     "HubError": "daedalus.policy.saving.hub",
     "NoPolicyError": "daedalus.policy.saving.saved_policy",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
-    "RunDataError": "daedalus.cli.comparing.recorded_run",
+    "RunDataError": "daedalus.analysis.recorded_run",
     "RunResult": "daedalus.launch.train_function",
     "SettingsError": "daedalus.learner.run.settings",
     "TrainingError": "daedalus.launch.train_function",
@@ -66,7 +66,7 @@ _MODULES = {
     "VideoError": "daedalus.actor.evaluation.video",
     "evaluate": "daedalus.launch.evaluation",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
-    "read_metrics": "daedalus.cli.comparing.recorded_run",
+    "read_metrics": "daedalus.analysis.recorded_run",
     "train": "daedalus.launch.train_function",
 }
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "gateway", "launch", "cli")
+PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "gateway", "launch", "analysis", "cli")
 ALLOWED = {
     "protocol": {"protocol"},
     "transport": {"protocol", "transport"},
@@ -18,7 +18,8 @@ ALLOWED = {
     "actor": {"protocol", "transport", "policy", "algorithms", "actor"},
     "learner": {"protocol", "transport", "policy", "algorithms", "learner"},
     "gateway": {"protocol", "transport", "policy", "actor", "gateway"},
-    "launch": {*PACKAGES} - {"cli"},
+    "launch": {*PACKAGES} - {"analysis", "cli"},
+    "analysis": {*PACKAGES} - {"cli"},
     "cli": {*PACKAGES},
 }
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}

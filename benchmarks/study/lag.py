@@ -24,8 +24,7 @@ import numpy as np
 from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import machine, table
 from benchmarks.study.tasks import TASKS, VARIANTS, specification
-from daedalus.cli.comparing.comparison import estimate, improvement
-from daedalus.cli.comparing.tables import written
+from daedalus.analysis.comparison import estimate, improvement, written
 
 _IDENTITY = ("task", "variant", "lag", "seed", "budget")
 _RESULTS = ("env_steps", "final_return", "env_steps_to_threshold", "lag_mean", "seconds")

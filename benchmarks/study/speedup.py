@@ -37,8 +37,7 @@ from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import COMMAND, machine, table
 from benchmarks.study.simulated_actors import train_simulated
 from daedalus.actor.environments.make import make_environments
-from daedalus.cli.comparing.comparison import estimate
-from daedalus.cli.comparing.tables import written
+from daedalus.analysis.comparison import estimate, written
 from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.protocol.spec import EnvironmentSpec

@@ -4,11 +4,10 @@ import argparse
 import itertools
 from pathlib import Path
 
+from daedalus.analysis.comparison import as_csv, as_text, compare_groups
+from daedalus.analysis.recorded_run import SECONDS
+from daedalus.analysis.run_groups import select
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.comparing.comparison import compare_groups
-from daedalus.cli.comparing.recorded_run import SECONDS
-from daedalus.cli.comparing.selection import select
-from daedalus.cli.comparing.tables import as_csv, as_text
 from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 

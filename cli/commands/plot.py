@@ -3,11 +3,11 @@
 import argparse
 from pathlib import Path
 
+from daedalus.analysis.charts import COLUMNS, INSTALL, draw_curves, draw_profiles
+from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS
+from daedalus.analysis.run_groups import select
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
-from daedalus.cli.comparing.drawing import COLUMNS, INSTALL, draw_curves, draw_profiles
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
-from daedalus.cli.comparing.selection import select
 from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 

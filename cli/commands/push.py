@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
 
 def push(arguments: list[str]) -> int:
     """Run `daedalus push` and return its exit status: 0 done, 1 failed, 2 bad usage."""
-    from daedalus.cli.hub.upload import push as upload
+    from daedalus.analysis.hub_upload import push as upload
 
     parsed = parser().parse_args(arguments)
     configure_logging(

@@ -1,17 +1,14 @@
 """`daedalus report`: write one HTML file about one or more runs."""
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
+from daedalus.analysis.charts import INSTALL
+from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS, read_record
+from daedalus.analysis.run_groups import select
+from daedalus.analysis.run_report import comparison_page, run_page
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
-from daedalus.cli.comparing.grouping import Group
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
-from daedalus.cli.comparing.selection import select
-from daedalus.cli.reports.page import comparison_page, run_page
-from daedalus.cli.reports.run_record import RunRecord, read_record
 from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.regular_files import replace_text
@@ -65,20 +62,20 @@ def report(arguments: list[str]) -> int:
     """Run `daedalus report` and return its exit status: 0 done, 1 failed."""
     parsed, parts = parse_groups(parser(), arguments)
     try:
-        groups, problems = select(parts, finished=False, columns=[SECONDS])
-        groups, records, damaged = _read_records(groups)
-        problems += damaged
+        groups, problems = select(parts, finished=False, columns=[SECONDS], read=read_record)
         for problem in problems:
             print_error("report", problem)
+        if len(groups) == 1 and len(groups[0].runs) == 1 and not problems:
+            page, output = run_page(groups[0], parsed.by), parsed.output or groups[0].runs[0].directory / _NAME
+        else:
+            page = comparison_page(groups, parsed.by, threshold=parsed.threshold, left_out=problems)
+            output = parsed.output or Path(_NAME)
     except RunDataError as error:
         print_error("report", error)
         return 1
-    if len(records) == 1 and not problems:
-        ((directory, record),) = records.items()
-        page, output = run_page(record, groups[0], parsed.by), parsed.output or directory / _NAME
-    else:
-        page = comparison_page(groups, records, parsed.by, threshold=parsed.threshold, left_out=problems)
-        output = parsed.output or Path(_NAME)
+    except ModuleNotFoundError:
+        print_error("report", INSTALL)
+        return 1
     try:
         replace_text(output, page)
     except OSError as error:
@@ -86,21 +83,3 @@ def report(arguments: list[str]) -> int:
         return 1
     say(f"wrote {output}")
     return 0
-
-
-def _read_records(groups: Sequence[Group]) -> tuple[list[Group], dict[Path, RunRecord], list[str]]:
-    """Return the records of the runs by directory, the groups of these runs, and one line for each run left out.
-
-    Raises RunDataError if no run is left.
-    """
-    records: dict[Path, RunRecord] = {}
-    problems: list[str] = []
-    for run in (run for group in groups for run in group.runs):
-        try:
-            records[run.directory] = read_record(run)
-        except RunDataError as error:
-            problems.append(str(error))
-    if not records:
-        raise RunDataError(problems[0])
-    kept = [replace(group, runs=[run for run in group.runs if run.directory in records]) for group in groups]
-    return [group for group in kept if group.runs], records, [f"left out: {problem}" for problem in problems]

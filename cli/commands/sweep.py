@@ -10,15 +10,11 @@ from pathlib import Path
 
 import tomli_w
 
+from daedalus.analysis.sweep_execution import Display, RunProcesses, Sweep, report
+from daedalus.analysis.sweep_plan import Axis, Choices, Planner, read_axis
+from daedalus.analysis.sweep_search import INSTALL, GridSearch, SampledSearch, Search, import_optuna
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.settings_arguments import add_log, add_settings, run_choice
-from daedalus.cli.sweeping.axes import Axis, Choices, read_axis
-from daedalus.cli.sweeping.display import Display
-from daedalus.cli.sweeping.plan import Planner
-from daedalus.cli.sweeping.processes import RunProcesses
-from daedalus.cli.sweeping.report import report
-from daedalus.cli.sweeping.searches import INSTALL, GridSearch, SampledSearch, Search, import_optuna
-from daedalus.cli.sweeping.sweep import Sweep
 from daedalus.launch.environment_check import EnvironmentProblemError, checked_defaults, checked_spaces
 from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.launch.process_lifecycle import stop_on_signals

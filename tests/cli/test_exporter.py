@@ -12,8 +12,8 @@ from processes import LIMIT, until
 from prometheus_client import CollectorRegistry
 from statuses import run_status
 
-from daedalus.cli.commands.exporter import StatusCollector, exporter
 from daedalus.launch import prometheus_exporter
+from daedalus.launch.prometheus_exporter import StatusCollector, exporter
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import StatusReport

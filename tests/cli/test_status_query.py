@@ -9,9 +9,9 @@ import pytest
 from building import EPOCH, SPACES, run_spec
 from statuses import actor_status, run_status
 
-from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
 from daedalus.gateway.watching.learner_source import LearnerSource
+from daedalus.launch.prometheus_exporter import StatusCollector
 from daedalus.learner.reporting import report
 from daedalus.learner.run import heartbeat
 from daedalus.learner.run.counters import RunCounters

@@ -10,7 +10,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from daedalus.cli.commands import train
-from daedalus.cli.other_runs import MAX_RUNS, OtherRuns
+from daedalus.launch.gateway_process import MAX_RUNS, OtherRuns
 
 Start = Callable[..., Running]
 

@@ -20,10 +20,9 @@ from processes import Running, processes_mentioning, until
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
+from daedalus.analysis.recorded_run import read_record
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.commands.train import report as report_of
-from daedalus.cli.comparing.recorded_run import read_run
-from daedalus.cli.reports.run_record import read_record
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.confirmation import Confirmations
 from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
@@ -378,7 +377,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     assert evaluation["select_best"] == []
     episodes = read_json(run / "evaluation.json")
     assert len(episodes["returns"]) == len(episodes["lengths"]) == 3
-    recorded = read_record(read_run(_with_metrics(run))).evaluation
+    recorded = read_record(_with_metrics(run)).evaluation
     assert recorded is not None
     assert (recorded.returns, recorded.policy_version) == (tuple(episodes["returns"]), 4)
     assert result["evaluation_return_mean"] == evaluation["return_mean"]

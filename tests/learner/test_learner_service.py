@@ -22,7 +22,7 @@ from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.service import ActorService
-from daedalus.cli.comparing.recorded_run import read_metrics
+from daedalus.analysis.recorded_run import read_metrics
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.progress import Progress

@@ -1,0 +1,1 @@
+"""What reads finished runs: compare, plot, report, sweep, push."""

@@ -1,0 +1,411 @@
+"""A run as its directory records it: settings, metrics and summary, and what a report shows besides.
+
+Nothing in the directory is trusted, because it may come from another machine: only regular files are read, up to a size
+limit, and checked. Files whose content a report shows as it is are not read through links, which could lead to any file
+of the reader's. Imports no module of a run."""
+
+import csv
+import json
+import math
+import os
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, Field, ValidationError
+
+from daedalus.learner.reporting.metrics_file import lasting
+from daedalus.learner.run.event_file import RecordedEvent, read_events
+from daedalus.learner.run.run_directory import CONFIG, EVALUATION, EVENTS, METRICS, OUTPUT, SUMMARY, VERSIONS
+from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
+from daedalus.learner.run.run_lock import is_locked
+from daedalus.learner.run.settings import SettingsError, run_spec
+from daedalus.policy.saving.regular_files import open_regular
+from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.texts import without_secrets
+
+SEED, ENVIRONMENT = "training.seed", "environment.id"
+RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
+EVALUATION_RETURN = "evaluation_return_mean"  # during training
+
+# Numbers that are computed with. Files of other releases, or that somebody changed, may have other values.
+_NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
+_SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
+_LARGEST = 1e300
+_MAX_METRICS_BYTES = 2 << 30  # a month of rows at the default log interval
+_MAX_OUTPUT_BYTES = 16 << 10
+_VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordedRun:
+    """One run, from the files in its directory."""
+
+    directory: Path
+    settings: Mapping[str, Any]  # by `section.key`; empty without config.toml
+    # Columns of metrics.csv, [rows]; NaN: no value. Without rows that a resumed run has undone.
+    metrics: Mapping[str, np.ndarray]
+    summary: Mapping[str, Any]  # summary.json; empty before the end of training
+
+    def setting(self, path: str) -> Any:
+        """Return a setting, or the part of one that is a table, such as `environment.kwargs.size`; None if unset.
+
+        A part that is None is "none".
+        """
+        section, *keys = path.split(".")
+        value = self.settings.get(".".join((section, *keys[:1])))
+        for key in keys[1:]:
+            value = (
+                (value[key] if value[key] is not None else "none")
+                if isinstance(value, Mapping) and key in value
+                else None
+            )
+        return value
+
+    @property
+    def unfinished(self) -> str:
+        """Why the run has no result yet, or an empty string."""
+        done = self.metrics[ENV_STEPS][-1]
+        budget = self.settings.get("training.env_steps", math.nan)
+        ended = self.summary.get("finished") or self.evaluation_return is not None
+        # A run that was resumed with a larger budget has made more steps than its summary says.
+        steps = self.summary.get("env_steps")
+        if ended and (steps is None or done <= steps):
+            return ""
+        running = is_locked(self.directory)
+        command = f"daedalus resume {shlex.quote(str(self.directory))}"
+        remedy = "it is still running" if running else f"continue it with: {command}"
+        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
+
+    @property
+    def evaluation_return(self) -> float | None:
+        """Mean return of the final evaluation, or None without one."""
+        return self.summary.get("evaluation_return_mean")
+
+    @property
+    def training_return(self) -> float:
+        """Mean return of the last training episodes; NaN if no episode has ended."""
+        means = self.metrics[RETURN]
+        known = means[~np.isnan(means)]
+        return float(known[-1]) if len(known) else math.nan
+
+    @property
+    def target(self) -> float | None:
+        """The target return of the run, or None."""
+        return self.settings.get("training.target_return")
+
+    @property
+    def environment(self) -> EnvironmentSpec | None:
+        """Settings of the environment; None if this release does not know them."""
+        values = {
+            key.partition(".")[2]: value for key, value in self.settings.items() if key.startswith("environment.")
+        }
+        try:
+            return EnvironmentSpec.model_validate(values)
+        except ValidationError:
+            return None
+
+    @property
+    def trains_true_task(self) -> bool:
+        """Whether its training returns can be compared with those of evaluations."""
+        return self.environment is None or self.environment.trains_true_task
+
+    def reached(self, threshold: float, *, evaluated: bool = False) -> tuple[float, float]:
+        """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.
+
+        `evaluated` takes the mean returns of evaluations during training; NaN if there was none. Infinite if the mean
+        did not reach the threshold. The precision is that of the rows of metrics.csv, except for the target of a run
+        that stopped at it. The metrics need wall_seconds.
+        """
+        at_target = self.summary.get("solved") and threshold == self.target
+        steps, seconds = self.summary.get("env_steps"), self.summary.get("seconds_to_target")
+        if at_target and self.settings.get("training.stop_when_solved") and steps is not None and seconds is not None:
+            return float(steps), seconds / 60.0
+        rows = len(self.metrics[ENV_STEPS])
+        returns = self.metrics.get(EVALUATION_RETURN, np.full(rows, np.nan)) if evaluated else self.metrics[RETURN]
+        if evaluated and np.isnan(returns).all():
+            return math.nan, math.nan
+        above = returns >= threshold
+        episodes = self.metrics.get("episodes")
+        if episodes is not None and not evaluated:  # the mean of fewer episodes may be luck
+            above &= episodes >= self.settings.get("training.target_episodes", 1)
+        if not above.any():
+            return math.inf, math.inf
+        row = int(above.argmax())
+        at = self.metrics.get("evaluation_env_steps", self.metrics[ENV_STEPS]) if evaluated else self.metrics[ENV_STEPS]
+        return float(at[row]), float(self.metrics[SECONDS][row]) / 60.0
+
+
+def find_runs(paths: Iterable[Path]) -> list[Path]:
+    """Return the run directories that paths name. A folder of run directories, such as runs/, stands for all of them.
+
+    A run that has several paths is returned once, by the first of them. Raises RunDataError for a path that is neither.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if (path / CONFIG).exists() or (path / METRICS).exists():
+            found.append(path)
+            continue
+        inside = sorted(config.parent for config in path.glob(f"*/{CONFIG}"))
+        if not inside:
+            raise RunDataError(
+                f"{path} is not a run directory: it has neither {CONFIG} nor {METRICS}; "
+                "name a run directory, or a folder of run directories"
+                if path.exists()
+                else f"{path} does not exist: name a run directory, or a folder of run directories"
+            )
+        found += inside
+    runs: dict[Path, Path] = {}
+    for path in found:  # links give a run further paths
+        runs.setdefault(path.resolve(), path)
+    return list(runs.values())
+
+
+def one_run(directory: Path) -> Path:
+    """Return a path that is a run directory. Raises RunDataError for any other path."""
+    if find_runs([directory]) != [directory]:
+        raise RunDataError(f"{directory} is a folder of run directories: name one of them")
+    return directory
+
+
+def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
+    """Return the run in a directory; its metrics have at least env_steps, the return and `columns`.
+
+    Raises RunDataError.
+    """
+    return RecordedRun(
+        directory=directory,
+        settings=_settings(directory / CONFIG),
+        metrics=_metrics(directory, (ENV_STEPS, RETURN, *columns)),
+        summary=_summary(directory / SUMMARY),
+    )
+
+
+def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
+    """Return the metrics of a run, `metrics.csv`, as arrays [rows] by the names of the columns; NaN: no value.
+
+    docs/reference/metrics.md explains the columns. Rows that a resumed run has undone are left out.
+
+    Raises RunDataError if the directory has no metrics.
+    """
+    return dict(read_run(one_run(Path(directory))).metrics)
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    settings = read_toml(path)
+    if not settings:
+        return {}
+    try:
+        # With the defaults of settings that an earlier release did not have.
+        settings = run_spec(settings).model_dump(mode="json")
+    except SettingsError:  # another release may have had settings that this one does not have
+        settings = json.loads(json.dumps(settings, default=str))  # TOML has dates, too
+    return {
+        f"{section}.{key}": value
+        for section, values in settings.items()
+        if isinstance(values, dict)
+        for key, value in values.items()
+        if _is_usable(f"{section}.{key}", value)
+    }
+
+
+def _is_usable(setting: str, value: Any) -> bool:
+    """Return whether a value of config.toml is of the kind that other code relies on."""
+    return isinstance(value, str) if setting == ENVIRONMENT else setting not in _NUMBERS or _is_number(value)
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and abs(value) < _LARGEST)
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    content = read_json(path) or {}
+    for name in _SUMMARY_NUMBERS:
+        if not _is_number(content.get(name)):
+            raise RunDataError(f"{path} is damaged: {name} is not a number")
+    return content
+
+
+def record_command(directory: Path) -> str:
+    """Return the command that evaluates a run and records the result in its directory."""
+    return f"daedalus evaluate {shlex.quote(str(directory))} --record"
+
+
+def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the columns of metrics.csv, [rows]. The line that a running learner is writing is left out."""
+    path = directory / METRICS
+    nothing = f"{directory} has no metrics yet: wait until the run has made its first updates"
+    content = read_file(path, _MAX_METRICS_BYTES)
+    if content is None:
+        raise RunDataError(nothing)
+    try:
+        text = content.decode()
+        header, *rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RunDataError(f"{path} is damaged: {error}") from None
+    except ValueError:  # no line at all
+        raise RunDataError(nothing) from None
+    missing = [column for column in columns if column not in header]
+    if missing:
+        raise RunDataError(
+            f"{path} has no column {missing[0]}: it is not the metrics of a run, or those of an old release"
+        )
+    if not rows:
+        raise RunDataError(nothing)
+    values = [_numbers(path, number, row, len(header)) for number, row in enumerate(rows, start=2)]
+    found = dict(zip(header, np.array(values).T, strict=True))
+    kept = lasting(*(found[name] for name in (ENV_STEPS, SECONDS) if name in found))
+    return {name: column[kept] for name, column in found.items()}
+
+
+def _numbers(path: Path, line: int, row: Sequence[str], cells: int) -> list[float]:
+    if len(row) != cells:
+        raise RunDataError(f"{path} is damaged: line {line} has {len(row)} cells, and the header has {cells}")
+    try:
+        return [float(cell) if cell else math.nan for cell in row]
+    except ValueError as error:
+        raise RunDataError(f"{path} is damaged: line {line}: {error}") from None
+
+
+class RecordedEvaluation(BaseModel, allow_inf_nan=False, frozen=True):
+    """Result of `daedalus evaluate --json`. Without the returns of the episodes in runs of earlier releases."""
+
+    environment: str
+    backend: str
+    policy_version: int
+    episodes: int = Field(ge=1)
+    actions: str
+    seed: int | None = None
+    best_checkpoint: bool = False
+    notes: tuple[str, ...] = ()
+    return_mean: float
+    return_std: float
+    return_min: float
+    return_max: float
+    length_mean: float
+    returns: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Video:
+    """A video in a run directory."""
+
+    path: Path
+    media_type: str
+    size: int  # in bytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunRecord(RecordedRun):
+    """All that the directory of a run records, for a report."""
+
+    evaluation: RecordedEvaluation | None  # the last recorded one
+    confirmation: Mapping[str, Any]  # of summary.json; empty without one
+    versions: Mapping[str, str]
+    events: Sequence[RecordedEvent]
+    output: str  # the end of what actors and evaluations printed
+    video: Video | None
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self.directory.resolve().name
+
+    @property
+    def status(self) -> str:
+        """How the run ended, in one word or two."""
+        if self.unfinished:
+            return "not finished"
+        return "solved" if self.summary.get("solved") else "finished"
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Rejected rollouts of a run that has a summary, by cause."""
+        causes = self.summary.get("rollouts_rejected")
+        if not isinstance(causes, dict):
+            return {}
+        return {cause: count for cause, count in causes.items() if isinstance(count, int) and count > 0}
+
+    def number(self, name: str) -> float | None:
+        """Return a finite number of summary.json, or else the last one of the column of metrics.csv, or None."""
+        value = finite(self.summary.get(name))
+        if value is not None or name not in self.metrics:
+            return value
+        column = self.metrics[name]
+        known = column[np.isfinite(column)]
+        return float(known[-1]) if len(known) else None
+
+
+def read_record(directory: Path, columns: Sequence[str] = ()) -> RunRecord:
+    """Return all that a directory records of a run. See `read_run`. Raises RunDataError."""
+    run = read_run(directory, columns)
+    try:
+        events = list(read_events(directory))
+    except OSError as error:
+        raise RunDataError(f"{directory / EVENTS}: {error.strerror}") from None
+    confirmation = run.summary.get("confirmation")
+    versions = read_json(directory / VERSIONS) or {}
+    return RunRecord(
+        directory=directory,
+        settings=run.settings,
+        metrics=run.metrics,
+        summary=run.summary,
+        evaluation=_evaluation(run),
+        confirmation=confirmation if isinstance(confirmation, dict) else {},
+        versions={name: str(value) for name, value in versions.items() if value is not None},
+        events=events,
+        output=_end_of(directory / OUTPUT),
+        video=_video(directory),
+    )
+
+
+def finite(value: Any) -> float | None:
+    """Return a value that was read as a float, or None if it is not a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    with suppress(OverflowError):
+        return float(value) if math.isfinite(value) else None
+    return None
+
+
+def _evaluation(run: RecordedRun) -> RecordedEvaluation | None:
+    path = run.directory / EVALUATION
+    content = read_json(path) or run.summary.get("evaluation")
+    if not content:
+        return None
+    try:
+        return RecordedEvaluation.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise RunDataError(
+            f"{path} is damaged ({where}: {first['msg']}): write it again with: {record_command(run.directory)}"
+        ) from None
+
+
+def _end_of(path: Path) -> str:
+    if path.is_symlink():
+        return ""
+    try:
+        with open_regular(path) as file:
+            file.seek(max(os.fstat(file.fileno()).st_size - _MAX_OUTPUT_BYTES, 0))
+            return without_secrets(file.read(_MAX_OUTPUT_BYTES).decode("utf-8", "replace").strip())
+    except OSError:
+        return ""
+
+
+def _video(directory: Path) -> Video | None:
+    """Return the newest video in a run directory."""
+    found = [
+        path
+        for path in directory.iterdir()
+        if path.suffix.lower() in _VIDEOS and path.is_file() and not (path.is_symlink() or path.name.startswith("."))
+    ]
+    if not found:
+        return None
+    newest = max(found, key=lambda path: path.stat().st_mtime_ns)
+    return Video(path=newest, media_type=_VIDEOS[newest.suffix.lower()], size=newest.stat().st_size)

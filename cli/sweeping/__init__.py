@@ -1,1 +1,0 @@
-"""A sweep: runs of many settings and seeds on this machine."""

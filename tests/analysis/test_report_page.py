@@ -1,0 +1,92 @@
+"""The page of `daedalus report` in a real browser: it loads nothing, runs nothing, and everybody can read it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import AXE, chromium
+from recorded_runs import record
+from test_run_report import GIF, HOSTILE, evaluated, happened
+
+from daedalus.actor.environments.rendering import FrameRate
+from daedalus.actor.evaluation.video import Video
+from daedalus.cli.commands.report import report
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> list[Path]:
+    """Reports of a run with everything, of a run with little, and of several runs."""
+    folder = tmp_path_factory.mktemp("reports")
+    rich = evaluated(record(folder / "rich", rollouts_rejected={"stale": 3}), notes=[HOSTILE])
+    happened(rich, ("started", "", "serving"), ("left", HOSTILE, HOSTILE), ("refused", "arm", "no such environment"))
+    (rich / "output.log").write_text(f"{HOSTILE}\n" * 100)
+    pytest.importorskip("av")
+    with Video(rich / "replay.mp4") as video:
+        for shade in range(20):
+            video.add(np.full((64, 64, 3), 10 * shade, np.uint8), FrameRate())
+    poor = record(folder / "poor", evaluation=None, finished=False)
+    (poor / "replay.gif").write_bytes(GIF)
+    record(folder / "other", settings=["collection.rollout_length=7"], returns=[None, None, 1.0])
+    assert report([str(rich)]) == report([str(poor)]) == 0
+    assert report([str(folder), "--output", str(folder / "report.html")]) == 0
+    return [rich / "report.html", poor / "report.html", folder / "report.html"]
+
+
+@pytest.fixture(params=["light", "dark"])
+def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
+    """Function that opens a file, in light and in dark, without a network. No page may complain or load anything."""
+    context = browser.new_context(color_scheme=request.param, offline=True)
+    page = context.new_page()
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("dialog", lambda dialog: complaints.append(dialog.message))
+    page.on("request", lambda asked: complaints.append(asked.url) if asked.url.startswith(("http", "ws")) else None)
+
+    def open_one(file: Path) -> Any:
+        page.goto(file.as_uri())
+        return page
+
+    yield open_one
+    context.close()
+    assert complaints == []
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_the_page_shows_what_it_has_without_network(reports: list[Path], opened: Any, index: int) -> None:
+    page = opened(reports[index])
+    assert page.locator("figure svg").count() >= 4
+    text = page.locator("figure svg text").first
+    assert text.evaluate("each => getComputedStyle(each).fill") == text.evaluate(
+        "each => getComputedStyle(document.querySelector('footer')).color"
+    )
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    page.set_viewport_size({"width": 360, "height": 740})
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_the_video_plays(reports: list[Path], opened: Any) -> None:
+    page = opened(reports[0])
+    page.wait_for_function("document.querySelector('video').videoWidth === 64")
+    assert page.locator("video").evaluate("video => video.duration") == pytest.approx(20 / 30, abs=0.1)
+    page = opened(reports[1])
+    assert page.locator("img").evaluate("picture => picture.naturalWidth") == 1
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_axe_finds_nothing(reports: list[Path], opened: Any, index: int) -> None:
+    if not AXE.exists():
+        pytest.skip("axe-core is not installed: run `make examples`")
+    page = opened(reports[index])
+    page.evaluate("document.querySelectorAll('details').forEach(each => each.open = true)")
+    page.evaluate(AXE.read_text("utf-8"))
+    found = page.evaluate("async () => (await axe.run()).violations")
+    assert [f"{each['id']}: {node['html'][:150]}" for each in found for node in each["nodes"]] == []

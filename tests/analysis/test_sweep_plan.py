@@ -1,0 +1,93 @@
+"""Test of analysis/sweep_plan.py."""
+
+import argparse
+from pathlib import Path
+
+import pytest
+from planning import finish, planner
+
+from daedalus.analysis.sweep_plan import PlannedRun, has_begun, is_done, point_name
+from daedalus.cli.commands.train import train_parser
+from daedalus.cli.settings_arguments import run_choice
+from daedalus.learner.run.run_directory import SUMMARY
+from daedalus.learner.run.settings import SettingsError
+
+
+def as_trained(run: PlannedRun) -> argparse.Namespace:
+    """Return the options that `daedalus train` reads from the command line of a run."""
+    command, *words = run.words
+    assert command == "train"
+    return train_parser().parse_args(words)
+
+
+def test_the_command_line_of_a_run_gives_the_settings_that_are_planned(tmp_path: Path) -> None:
+    options = ["--env-steps", "5000", "--set", "policy.hidden=[32]", "--log", "wandb", "--log", "mlflow"]
+    point = {"collection.rollout_length": "5", "training.learning_rate": "1e-3"}
+    first, second = planner(tmp_path, *options).runs("n", point, [3, 4])
+    assert [run.directory for run in (first, second)] == [tmp_path / "n_seed-3", tmp_path / "n_seed-4"]
+    parsed = as_trained(second)
+    assert parsed.run_dir == second.directory
+    assert parsed.log == ["wandb", "mlflow"]
+    assert run_choice(parsed).spec() == second.spec
+    assert second.spec.training.seed == 4
+    assert second.spec.training.env_steps == 5000
+    assert second.spec.policy.hidden == (32,)
+    assert (second.spec.collection.rollout_length, second.spec.training.learning_rate) == (5, 1e-3)
+
+
+def test_an_algorithm_brings_the_settings_of_its_preset(tmp_path: Path) -> None:
+    (run,) = planner(tmp_path).runs("a3c", {"training.algorithm": "a3c"}, [1])
+    assert run.spec.collection.rollout_length == 16  # of the preset's for_algorithm table
+    assert run_choice(as_trained(run)).spec() == run.spec
+
+
+def test_settings_that_are_not_valid_are_refused_before_any_run(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"collection\.rollout_length"):
+        planner(tmp_path).runs("n", {"collection.rollout_length": "-1"}, [1])
+    with pytest.raises(SettingsError, match=r"did you mean collection\.rollout_length\?"):
+        planner(tmp_path).runs("n", {"collection.rolout_length": "5"}, [1])
+
+
+@pytest.mark.parametrize(
+    ("point", "name"),
+    [
+        ({"a.rollout_length": "5", "b.learning_rate": "1e-3"}, "rollout_length-5_learning_rate-1e-3"),
+        ({"policy.hidden": "[64, 64]"}, "hidden-64x64"),
+        ({"policy.hidden": "[64]"}, "hidden-64x"),
+        ({}, ""),
+    ],
+)
+def test_folders_have_the_names_of_the_values(point: dict[str, str], name: str) -> None:
+    assert point_name(point) == name
+
+
+def test_different_values_have_different_names_without_special_characters() -> None:
+    values = ["a/b", "a-b", "../x", "[a, b]", "m:C", "x" * 500, "y" * 500, "5", "[5]", "[5,5]", "55"]
+    names = [point_name({"a.b": value}) for value in values]
+    assert len(set(names)) == len(values)
+    assert all("/" not in name and " " not in name and len(name) < 150 for name in names)
+
+
+def test_a_run_is_done_when_it_was_evaluated(tmp_path: Path) -> None:
+    (run,) = planner(tmp_path).runs("", {}, [1])
+    assert run.name == "seed-1"
+    assert (has_begun(run), is_done(run)) == (False, False)
+    finish(run)
+    assert (has_begun(run), is_done(run)) == (True, True)
+    (run.directory / SUMMARY).write_text('{"finished": true, "evaluation": null}')
+    assert (has_begun(run), is_done(run)) == (True, False)
+    (run.directory / SUMMARY).write_text("")  # as a machine that crashes may leave it
+    assert (has_begun(run), is_done(run)) == (True, False)
+    assert run.resume_words == ("resume", str(run.directory))
+
+
+def test_a_run_that_was_begun_with_other_settings_is_refused(tmp_path: Path) -> None:
+    (run,) = planner(tmp_path).runs("", {}, [1])
+    finish(run)
+    planner(tmp_path).runs("", {}, [1])
+    with pytest.raises(SettingsError) as error:
+        planner(tmp_path, "--env-steps", "7000").runs("", {}, [1])
+    assert str(error.value) == (
+        f"{run.directory} was begun with other settings (training.env_steps is 1500000, and not 7000): "
+        "choose another --folder, or remove this one"
+    )
