@@ -12,8 +12,9 @@ from processes import LIMIT, until
 from prometheus_client import CollectorRegistry
 from statuses import run_status
 
+from daedalus.cli.commands.exporter import exporter
 from daedalus.launch import prometheus_exporter
-from daedalus.launch.prometheus_exporter import StatusCollector, exporter
+from daedalus.launch.prometheus_exporter import StatusCollector
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import StatusReport
@@ -77,6 +78,7 @@ def test_a_missing_package_is_reported_with_the_extra_that_installs_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    monkeypatch.delitem(sys.modules, "daedalus.launch.prometheus_exporter")
     assert exporter(["--connect", UNUSED]) == 1
     message = capsys.readouterr().err
     assert 'pip install "daedalus-rl[monitoring]"' in message

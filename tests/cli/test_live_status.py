@@ -13,7 +13,7 @@ from processes import LIMIT, until
 from statuses import actor_status, run_status
 from terminal import Terminal
 
-from daedalus.cli import run_watcher, screen
+from daedalus.cli import screen
 from daedalus.cli.commands import status as status_module
 from daedalus.cli.commands.status import status as status_command
 from daedalus.cli.run_watcher import looks
@@ -116,7 +116,7 @@ def test_status_watch_redraws_a_frame_until_ctrl_c(tty: Tty, monkeypatch: pytest
             if len(frames) == 3:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_watcher, "_FRAME_SECONDS", 0.0)
+    monkeypatch.setattr(status_module, "_FRAME_SECONDS", 0.0)
     monkeypatch.setattr(status_module, "connect_until_interrupted", learner.connect)
     monkeypatch.setattr(status_module, "Screen", lambda: Interrupted(tty, tty))
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch"]) == 0
@@ -147,7 +147,7 @@ def test_status_watch_prints_lines_elsewhere(
     name = "_json" if options else "_text"
     original: Callable[[RunStatus], str] = getattr(status_module, name)
     monkeypatch.setattr(status_module, name, interrupted)
-    monkeypatch.setattr(run_watcher, "_TEXT_SECONDS", 0.0)
+    monkeypatch.setattr(status_module, "_TEXT_SECONDS", 0.0)
     monkeypatch.setattr(status_module, "connect_until_interrupted", connect)
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch", *options]) == 0
     printed = capsys.readouterr()

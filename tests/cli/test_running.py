@@ -13,6 +13,7 @@ from daedalus.launch import final_evaluation, local_training, run_choice
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.local_run import LocalRun, RunFailedError
 from daedalus.launch.local_training import run_locally
+from daedalus.launch.logs import LogOptions
 from daedalus.launch.supervision import Supervised
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.protocol.spec import RunSpec
@@ -72,7 +73,7 @@ def test_a_run_that_failed_after_a_checkpoint_says_how_to_continue_it(
 
     monkeypatch.setattr(train_command, "run_locally", fail)
     monkeypatch.setattr(run_choice, "checked_spaces", lambda *_, **_others: None)
-    monkeypatch.setattr(train_command, "configure_logging", lambda *_, **_others: None)
+    monkeypatch.setattr(LogOptions, "configure", lambda *_, **_others: None)
     monkeypatch.setattr(train_command, "stop_on_signals", lambda **_: threading.Event())
     monkeypatch.setattr(train_command.signal, "signal", lambda *_: None)
     assert train_command.train(["cartpole", "--run-dir", str(directory)]) == 1

@@ -201,7 +201,7 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr("daedalus.cli.commands.exporter._MAX_ACTORS", 2 * PAGE_ACTORS)
+    monkeypatch.setattr("daedalus.launch.prometheus_exporter._MAX_ACTORS", 2 * PAGE_ACTORS)
     collector = StatusCollector()
     collector.transport = operator
     samples = []
