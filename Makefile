@@ -8,10 +8,10 @@ PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
-# Four processes share the tests, also on two cores: many tests wait for the processes that they start. The tests of one
-# file run in one process, because they share what they start.
+# Six processes share the tests, also on two cores: many tests wait for the processes that they start, and their files come
+# first. The tests of one file run in one process, because they share what they start.
 test: check
-	$(BIN)/pytest --numprocesses 4 --dist loadfile
+	$(BIN)/pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder
 
 # Trackio needs an older pillow than constraints.txt: for its test it is installed into a folder of its own.
 test-trackio: .venv/ready-test
@@ -71,6 +71,7 @@ docs: .venv/ready-docs
 # The parts of the documentation that are made from the code: a test fails while they differ.
 docs-reference: .venv/ready-train
 	$(BIN)/python docs/generate_reference.py
+	$(BIN)/python docs/trace_rollout.py
 
 .venv/ready-docs: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

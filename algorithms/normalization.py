@@ -12,7 +12,7 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.running_returns import RunningReturns
-from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.protocol.keys import first_of_largest_owner, owner
 from daedalus.protocol.uploads import Rollout
 
@@ -28,6 +28,7 @@ _FAR = 1e5  # ratio of a vote that is far outside, to all that other actors have
 _CONSTANT = 1e-9  # ratio of the deviation of a constant to its size: rounding
 _RECENT = 4  # times the rows of all votes: moments of no more may be forgotten
 _ESTABLISHED = 8192.0  # values, from which on moments are a witness of their own
+_NO_SQUARES = torch.zeros((), dtype=torch.float64)
 _LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly
 
 
@@ -133,20 +134,19 @@ class ConfirmedRange:
         self._far: dict[str, np.ndarray] = {}  # largest magnitudes [*shape] that were far outside, by owner
         self._summary: _Summary | None = None
 
-    def add(self, actor: str, moments: Moments) -> None:
-        """Add the moments of a rollout as a vote of its actor."""
-        if not moments.number or not np.isfinite(_magnitude(moments)).all():
+    def add(self, actor: str, vote: "_Vote") -> None:
+        """Add a rollout's vote of its actor."""
+        if not math.isfinite(vote.largest):
             return
-        voter = self._voters.pop(actor, None) or _Voter(self._votes)
+        voter = self._voters.pop(actor, None) or _Voter(self._votes, vote.mean.shape)
         self._heard += 1
-        voter.add(moments, self._heard)
+        voter.add(vote, self._heard)
         self._voters[actor] = voter
         silent = self._heard - 32 * len(self._voters)
-        gone = [name for name, each in self._voters.items() if each.heard < silent]
+        while self._voters[oldest := next(iter(self._voters))].heard < silent:
+            self.forget(oldest)
         if len(self._voters) > self._most_voters:
-            gone.append(first_of_largest_owner(self._voters))
-        for name in gone:
-            self.forget(name)
+            self.forget(first_of_largest_owner(self._voters))
         if self._summary is not None and self._heard >= self._summary.heard + len(self._voters):
             self._summary = None  # in a large fleet it is computed after many votes
 
@@ -155,12 +155,13 @@ class ConfirmedRange:
         if self._voters.pop(actor, None) is not None:
             self._summary = None
 
-    def is_far(self, actor: str, moments: Moments) -> bool:
-        """Return whether moments are far outside all that the other actors have shown."""
-        if not moments.number or not (magnitude := _magnitude(moments)).max(initial=0.0) > _FAR:
+    def is_far(self, actor: str, vote: "_Vote") -> bool:
+        """Return whether a vote is far outside all that the other actors have shown."""
+        if not vote.largest > _FAR:
             return False
+        magnitude = vote.magnitude
         others = [voter for name, voter in self._voters.items() if name != actor]
-        if sum(len(voter.means) for voter in others) < _FEW_VOTES:
+        if sum(voter.number for voter in others) < _FEW_VOTES:
             return False
         largest = np.max([voter.largest for voter in others], 0).clip(min=1.0)
         if not (magnitude > _FAR * largest).any():
@@ -197,17 +198,17 @@ class ConfirmedRange:
         if not self._voters or not moments.number:
             return mean, np.ones_like(mean)
         summary = self._summarized()
-        center, scale = summary.center, summary.scale
+        center, most = summary.center, summary.most
         if past is not None and (summary.is_even or summary.is_few):  # the past decides between two halves
             known, past_mean = past.count.numpy() >= _ESTABLISHED, past.mean.numpy()
             decided = past_mean if summary.is_few else _median([*summary.centers, past_mean])
+            scale = summary.scale
             if (known & (decided != center)).any():
                 center = np.where(known, decided, center)
                 scale = self._scale(center)
             if summary.is_few:
                 scale = np.where(known, np.minimum(scale, past.variance.sqrt().numpy()), scale)
-        size = np.abs(center).clip(min=1.0)
-        most = _LARGEST_RATIO * np.where(scale > _CONSTANT * size, scale, size)
+            most = _most(center, scale)
         distance = np.sqrt((mean - center) ** 2 + _variance(moments))
         return center, most / np.maximum(distance, most)
 
@@ -224,20 +225,22 @@ class ConfirmedRange:
     def _summarized(self) -> "_Summary":
         if self._summary is None:
             voters = list(self._voters.values())
-            centers = self._of_owners(_median, lambda voter: voter.center)
+            centers = self._of_owners(_median, lambda voter: _median(voter.means))
             recent = self._of_owners(_confirmed, lambda voter: _confirmed(voter.magnitudes))
             shown = self._of_owners(lambda values: np.max(values, 0), lambda voter: voter.second)
             apart = _VOTES if len(centers) > 2 else 0  # of two owners, either may be right
             center = _median(centers)
+            scale = self._scale(center)
             self._summary = _Summary(
                 heard=self._heard,
                 centers=centers,
                 center=center,
-                scale=self._scale(center),
+                scale=scale,
+                most=_most(center, scale),
                 recent=_confirmed(recent, most=apart).clip(min=1.0),
                 shown=_confirmed(shown, most=apart).clip(min=1.0),
                 rows=sum(sum(voter.rows) for voter in voters),
-                is_few=len(voters) == 1 and len(voters[0].means) < _VOTES,
+                is_few=len(voters) == 1 and voters[0].number < _VOTES,
             )
         return self._summary
 
@@ -245,7 +248,7 @@ class ConfirmedRange:
         """Return R [*shape], 0 in a number that was constant."""
 
         def of_voter(voter: _Voter) -> np.ndarray:
-            return _confirmed(np.sqrt((np.array(voter.means) - center) ** 2 + np.array(voter.variances)))
+            return _confirmed(np.sqrt((voter.means - center) ** 2 + voter.variances))
 
         return _confirmed(self._of_owners(_confirmed, of_voter), most=_VOTES)
 
@@ -259,33 +262,59 @@ class ConfirmedRange:
         return [together(values) for values in of_owners.values()]
 
 
+class _Vote(NamedTuple):
+    """The moments of a rollout; arrays [*shape]."""
+
+    rows: int
+    mean: np.ndarray
+    variance: np.ndarray
+    magnitude: np.ndarray
+    largest: float  # magnitude
+
+
+def _vote(moments: Moments) -> _Vote:
+    mean, variance = moments.mean.numpy(), _variance(moments)
+    magnitude = np.sqrt(mean**2 + variance)
+    return _Vote(int(moments.number), mean, variance, magnitude, float(magnitude.max(initial=0.0)))
+
+
 class _Voter:
     """The newest votes of one actor."""
 
-    def __init__(self, votes: int) -> None:
-        self.means: deque[np.ndarray] = deque(maxlen=votes)
-        self.variances: deque[np.ndarray] = deque(maxlen=votes)
+    def __init__(self, votes: int, shape: tuple[int, ...]) -> None:
+        self._means, self._variances = np.empty((2, votes, *shape))
         self.rows: deque[int] = deque(maxlen=votes)
-        self.center = np.zeros(())  # median of the means [*shape]
         self.largest = self.second = np.zeros(())  # largest magnitudes [*shape] that it has ever shown
+        self.number = 0  # of its votes that are kept
         self.heard = 0
+        self._next = 0  # where the next vote is written
 
-    def add(self, moments: Moments, heard: int) -> None:
-        self.means.append(moments.mean.numpy())
-        self.variances.append(_variance(moments))
-        self.rows.append(int(moments.number))
-        self.center = _median(self.means)
-        magnitude = _magnitude(moments)
-        self.second = np.maximum(self.second, np.minimum(magnitude, self.largest)) if self.heard else magnitude
-        if len(self.means) == 2:  # the first vote was the only one
-            self.second = np.minimum(magnitude, self.largest)
-        self.largest = np.maximum(magnitude, self.largest)
+    def add(self, vote: _Vote, heard: int) -> None:
+        self._means[self._next], self._variances[self._next] = vote.mean, vote.variance
+        self._next = (self._next + 1) % len(self._means)
+        self.rows.append(vote.rows)
+        self.number = len(self.rows)
+        twice = np.minimum(vote.magnitude, self.largest)
+        self.second = np.maximum(self.second, twice) if self.heard else vote.magnitude
+        if self.number == 2:  # the first vote was the only one
+            self.second = twice
+        self.largest = np.maximum(vote.magnitude, self.largest)
         self.heard = heard
+
+    @property
+    def means(self) -> np.ndarray:
+        """Means of the votes [votes, *shape]."""
+        return self._means[: self.number]
+
+    @property
+    def variances(self) -> np.ndarray:
+        """Variances of the votes [votes, *shape]."""
+        return self._variances[: self.number]
 
     @property
     def magnitudes(self) -> np.ndarray:
         """Magnitudes of the votes [votes, *shape]."""
-        return np.sqrt(np.array(self.means) ** 2 + np.array(self.variances))
+        return np.sqrt(self.means**2 + self.variances)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -296,6 +325,7 @@ class _Summary:
     centers: list[np.ndarray]  # of the owners
     center: np.ndarray  # c
     scale: np.ndarray  # R, 0 in a number that was constant
+    most: np.ndarray  # distance from c within which a vote counts in full
     recent: np.ndarray  # magnitude that the votes of one actor confirm, at least 1
     shown: np.ndarray  # magnitude that one actor has ever shown twice, at least 1
     rows: int  # of all votes
@@ -306,26 +336,32 @@ class _Summary:
         return len(self.centers) % 2 == 0
 
 
+def _most(center: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the distance from c within which a vote counts in full, by R."""
+    size = np.abs(center).clip(min=1.0)
+    return _LARGEST_RATIO * np.where(scale > _CONSTANT * size, scale, size)
+
+
 def _confirmed(values: Sequence[np.ndarray] | np.ndarray, most: int = 1) -> np.ndarray:
     """Return the largest of values [N, *shape] without the largest eighth, rounded up to at most `most`; of one, it."""
     number = len(values)
-    last = number - 1 - min((number + 6) // 8, most) if number > 1 else 0
+    if number == 1:
+        return values[0]
+    last = number - 1 - min((number + 6) // 8, most)
     return np.partition(np.asarray(values), last, 0)[last]
 
 
-def _median(values: Sequence[np.ndarray] | deque[np.ndarray]) -> np.ndarray:
-    """Return the median of values, each [*shape]; of the two in the middle the one nearer to 0."""
-    ordered = np.sort(np.array(values), 0)
+def _median(values: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+    """Return the median of values [N, *shape]; of the two in the middle the one nearer to 0."""
+    if len(values) == 1:
+        return np.array(values[0])  # a copy: votes are overwritten
+    ordered = np.sort(np.asarray(values), 0)
     lower, upper = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return np.where(np.abs(lower) <= np.abs(upper), lower, upper)
 
 
 def _variance(moments: Moments) -> np.ndarray:
     return moments.squares.numpy() / float(moments.number)
-
-
-def _magnitude(moments: Moments) -> np.ndarray:
-    return np.sqrt(moments.mean.numpy() ** 2 + _variance(moments))
 
 
 class ConfirmedRanges:
@@ -342,12 +378,13 @@ class ConfirmedRanges:
         for name, each in moments.items():
             if name not in self._ranges:
                 self._ranges[name] = ConfirmedRange(tuple(each.mean.shape))
-        far = next((name for name, each in moments.items() if self._ranges[name].is_far(actor, each)), "")
-        for name, each in moments.items():
-            if far:
-                self._ranges[name].forget(actor)
-            else:
-                self._ranges[name].add(actor, each)
+        votes = {name: _vote(each) for name, each in moments.items() if each.number}
+        far = next((name for name, vote in votes.items() if self._ranges[name].is_far(actor, vote)), "")
+        for name, each in self._ranges.items():
+            if far and name in moments:
+                each.forget(actor)
+            elif name in votes:
+                each.add(actor, votes[name])
         return far
 
     def merge(self, name: str, moments: Sequence[Moments], into: RunningMoments) -> None:
@@ -367,7 +404,7 @@ class ConfirmedRanges:
 
 def one(number: float) -> Moments:
     """Return the moments of one number, with which an actor votes on it."""
-    return Moments(1, torch.tensor(number, dtype=torch.float64), torch.zeros((), dtype=torch.float64))
+    return Moments(1, torch.tensor(number, dtype=torch.float64), _NO_SQUARES)
 
 
 def observations_name(component: str) -> str:

@@ -5,16 +5,14 @@ from typing import Any
 
 import torch
 
-from daedalus.algorithms.action_values import NStepQ, OneStepQ, OneStepSarsa
+from daedalus.algorithms import action_values, policy_gradient
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.algorithms.errors import AlgorithmError
-from daedalus.algorithms.policy_gradient import A2c, A3c, Appo, Impala
 from daedalus.policy.network.action_distribution import ActionDistribution
 from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
-from daedalus.protocol.algorithms import AlgorithmRecord, is_own
+from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmError, AlgorithmRecord, is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec
 
@@ -87,15 +85,16 @@ def _fault(name: str, error: Exception) -> AlgorithmError:
     return AlgorithmError(f"{_SETTING}={name}: {first_line(error)}{place_of(error)}")
 
 
-CLASSES: dict[str, type[Algorithm]] = {
-    "a2c": A2c,
-    "a3c": A3c,
-    "impala": Impala,
-    "appo": Appo,
-    "one_step_q": OneStepQ,
-    "one_step_sarsa": OneStepSarsa,
-    "n_step_q": NStepQ,
-}
+def _built_in() -> Iterator[tuple[str, type[Algorithm]]]:
+    """Yield the classes of the built-in algorithms, each by the name of its record."""
+    names = {id(record): name for name, record in ALGORITHMS.items()}
+    for module in (policy_gradient, action_values):
+        for kind in vars(module).values():
+            if isinstance(kind, type) and (name := names.get(id(vars(kind).get("record")))):
+                yield name, kind
+
+
+CLASSES = dict(_built_in())
 
 
 def build_algorithm(spec: LossSpec, distribution: ActionDistribution, modules: UserModules = NO_MODULES) -> Algorithm:

@@ -115,10 +115,9 @@ def vtrace_targets(
 
 def _accumulate(constants: Tensor, factors: Tensor, last: Tensor) -> Tensor:
     """Solve x_t = constants_t + factors_t x_{t+1} backwards from x_T = last. [T, B], [T, B], [B] -> [T, B]."""
-    result = torch.empty_like(constants)
-    following = last
-    for row in range(len(constants) - 1, -1, -1):
-        following = torch.addcmul(constants[row], factors[row], following, out=result[row])
+    result, following = constants.clone(), last
+    for row, factor in zip(reversed(result.unbind()), reversed(factors.unbind()), strict=True):
+        following = row.addcmul_(factor, following)
     return result
 
 

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from daedalus.learner.reporting.metrics_file import lasting
-from daedalus.learner.run.event_file import RecordedEvent, read_events
+from daedalus.learner.reporting.metrics_rows import lasting
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, EVENTS, METRICS, OUTPUT, SUMMARY, VERSIONS
 from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
+from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.texts import without_secrets

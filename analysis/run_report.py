@@ -30,7 +30,7 @@ from daedalus.analysis.run_results import (
     together,
     written,
 )
-from daedalus.learner.reporting.metrics import ENV, USER
+from daedalus.learner.reporting.metrics_rows import ENV, USER
 from daedalus.learner.run.run_directory import CONFIG
 from daedalus.protocol.texts import printable
 

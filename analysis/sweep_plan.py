@@ -131,7 +131,7 @@ class PlannedRun:
 
 
 class Planner:
-    """Planner of runs in one folder, from the options that `daedalus sweep` shares with `daedalus train`."""
+    """Planner of runs in one folder."""
 
     def __init__(
         self, choice: RunChoice, trackers: Sequence[str], folder: Path, defaults: dict[str, Any] | None = None

@@ -3,19 +3,23 @@
 import importlib
 import itertools
 import math
+import os
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from daedalus.analysis.sweep_plan import Axis, Choices, PlannedRun, Planner, Point, point_name
-from daedalus.learner.run.run_directory import SUMMARY, read_json, write_json
+from daedalus.analysis.sweep_plan import Axis, Choices, PlannedRun, Planner, Range, point_name
+from daedalus.learner.run.run_directory import SUMMARY, read_json
+from daedalus.learner.run.run_files import read_file
 from daedalus.learner.run.settings import SettingsError
 
-INSTALL = '--sampler needs Optuna, which is not installed: pip install "daedalus-rl[sweep]"'
-TRIALS = "trials.json"
+INSTALL = '--sampler needs Optuna, which is not installed: pip install "daedalus-rl[analysis]"'
+TRIALS = "trials.jsonl"
+_MAX_TRIALS_BYTES = 64 << 20
 
 
 def import_optuna() -> Any:
@@ -63,32 +67,31 @@ class GridSearch:
 class SampledSearch:
     """Points that Optuna's TPE sampler chooses by the results so far.
 
-    The points are written to a file, so that an interrupted sweep goes on with the same ones. Optuna keeps nothing.
+    Optuna keeps them, with their scores, in a file of JSON lines, so that an interrupted sweep goes on with the same
+    ones. It executes nothing that it reads there.
     """
 
     def __init__(
         self, planner: Planner, axes: Sequence[Axis], seeds: Sequence[int], *, trials: int, folder: Path
     ) -> None:
-        """Read the points of an interrupted sweep, if there are any.
+        """Read the points of an interrupted sweep, if there are any. The caller has locked the folder.
 
-        Raises ModuleNotFoundError without Optuna, SettingsError if the file of points does not fit.
+        Raises ModuleNotFoundError without Optuna, SettingsError and RunDataError if the file of points does not fit.
         """
         optuna = import_optuna()
-        self._planner, self._axes, self._seeds, self._trials = planner, axes, seeds, trials
-        self._file = folder / TRIALS
-        self._points = self._read()
-        self.planned: list[PlannedRun] = []
-        self.total = max(trials, len(self._points)) * len(seeds)
-        self._recorded = deque(enumerate(self._points))
-        self._waiting: deque[PlannedRun] = deque()
-        self._open: dict[int, _OpenTrial] = {}
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        sampler = optuna.samplers.TPESampler(
-            n_startup_trials=min(10, max(trials // 3, 1)),
-            seed=seeds[0] + len(self._points),  # with the same seed, it would choose the first points again
-        )
-        self._study = optuna.create_study(direction="maximize", sampler=sampler)
+        self._planner, self._seeds, self._trials = planner, seeds, trials
         self._distributions = {axis.key: _distribution(axis) for axis in axes}
+        self._study = _study(optuna, folder)
+        self._recorded = deque(self._usable(optuna, folder / TRIALS))
+        self._begun = len(self._recorded)
+        self._study.sampler = optuna.samplers.TPESampler(
+            n_startup_trials=min(10, max(trials // 3, 1)),
+            seed=seeds[0] + self._begun,  # with the same seed, it would choose the first points again
+        )
+        self.planned: list[PlannedRun] = []
+        self.total = max(trials, self._begun) * len(seeds)
+        self._waiting: deque[PlannedRun] = deque()
+        self._open: list[_OpenTrial] = []
 
     def take(self) -> PlannedRun | None:
         """Return the next run, of a new point if that is its turn. See Search. Raises SettingsError, OSError."""
@@ -97,66 +100,91 @@ class SampledSearch:
         return self._waiting.popleft()
 
     def ended(self, run: PlannedRun, *, failed: bool) -> None:
-        """Report the mean score of a point to Optuna after its last run. See Search."""
-        number, trial = next((number, trial) for number, trial in self._open.items() if run in trial.runs)
+        """Report the mean score of a point to Optuna after its last run, unless one failed. See Search."""
+        trial = next(trial for trial in self._open if run in trial.runs)
         trial.scores.append(math.nan if failed else score(run))
         if len(trial.scores) < len(trial.runs):
             return
-        del self._open[number]
+        self._open.remove(trial)
         value = float(np.mean(trial.scores))
-        if not math.isnan(value):
-            self._tell(trial, value)
+        if not math.isnan(value):  # else the point stays open: the same command tries its failed runs again
+            self._study.tell(trial.number, value, skip_if_finished=True)
 
     def _begin_trial(self) -> bool:
         """Plan the runs of the next point, and return whether there is one."""
-        asked = None
         if self._recorded:
-            number, point = self._recorded.popleft()
-        elif len(self._points) < self._trials:
-            asked = self._study.ask(self._distributions)
-            number, point = len(self._points), {axis.key: _written(axis, asked.params[axis.key]) for axis in self._axes}
-            self._points.append(point)
-            write_json(self._file, {"trials": self._points})
+            trial = self._recorded.popleft()
+        elif self._begun < self._trials:
+            trial = self._study.ask(self._distributions)
+            self._begun += 1
         else:
             return False
-        runs = self._planner.runs(f"trial-{number + 1:03d}", point, self._seeds)
-        self._open[number] = _OpenTrial(asked, point, runs)
+        point = {key: _written(trial.distributions[key], trial.params[key]) for key in self._distributions}
+        runs = self._planner.runs(f"trial-{trial.number + 1:03d}", point, self._seeds)
+        self._open.append(_OpenTrial(trial.number, runs))
         self._waiting += runs
         self.planned += runs
         return True
 
-    def _tell(self, trial: "_OpenTrial", value: float) -> None:
-        if trial.asked is not None:
-            self._study.tell(trial.asked, value)
-            return
-        try:
-            values = {axis.key: _read_value(axis, trial.point[axis.key]) for axis in self._axes}
-            self._study.add_trial(
-                import_optuna().trial.create_trial(params=values, distributions=self._distributions, value=value)
-            )
-        except ValueError:  # the command has other ranges than the one that chose this point
-            return
-
-    def _read(self) -> list[Point]:
-        if not self._file.exists():
-            return []
-        points = read_json(self._file).get("trials")
-        keys = {axis.key for axis in self._axes}
-        if not isinstance(points, list) or not all(
-            isinstance(point, dict) and point.keys() == keys for point in points
-        ):
-            raise SettingsError(
-                f"{self._file} is damaged, or is of a sweep over other settings: choose another --folder"
-            )
-        return points
+    def _usable(self, optuna: Any, file: Path) -> list[Any]:
+        """Return the trials of earlier commands. Raises SettingsError if they are over other settings."""
+        found = []
+        for trial in self._study.trials:
+            if trial.state == optuna.trial.TrialState.FAIL:
+                continue
+            if trial.distributions.keys() < self._distributions.keys():  # the command was killed as it chose the point
+                self._study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+                continue
+            try:
+                for key in {*trial.distributions, *self._distributions}:
+                    before, now = trial.distributions[key], self._distributions[key]
+                    optuna.distributions.check_distribution_compatibility(before, now)
+            except (KeyError, ValueError):
+                raise SettingsError(
+                    f"{file} is of a sweep over other settings or other kinds of values: choose another --folder"
+                ) from None
+            found.append(trial)
+        return found
 
 
+@dataclass(slots=True, eq=False)
 class _OpenTrial:
     """A point whose runs have not all ended."""
 
-    def __init__(self, asked: Any | None, point: Point, runs: Sequence[PlannedRun]) -> None:
-        self.asked, self.point, self.runs = asked, point, runs  # `asked` is None for a point of an interrupted sweep
-        self.scores: list[float] = []
+    number: int
+    runs: Sequence[PlannedRun]
+    scores: list[float] = field(default_factory=list)
+
+
+class _LockedFolder:
+    """Lock of the file of trials. The sweep holds a lock on its folder, which ends with the process."""
+
+    def acquire(self) -> bool:
+        """Do nothing: no other process writes the file."""
+        return True
+
+    def release(self) -> None:
+        """Do nothing."""
+
+
+def _study(optuna: Any, folder: Path) -> Any:
+    """Return the study that is kept in a folder; a new one if there is none.
+
+    Optuna reads JSON, and executes nothing. Raises SettingsError, RunDataError.
+    """
+    file, former = folder / TRIALS, folder / "trials.json"
+    if former.exists():
+        raise SettingsError(f"{former} is of a sweep of an older release, which cannot go on: choose another --folder")
+    content = read_file(file, _MAX_TRIALS_BYTES)
+    if content is not None:
+        os.truncate(file, content.rfind(b"\n") + 1)  # without a line that a crash of the machine has cut
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        backend = optuna.storages.journal.JournalFileBackend(str(file), lock_obj=_LockedFolder())
+        storage = optuna.storages.JournalStorage(backend)
+        return optuna.create_study(storage=storage, study_name="sweep", direction="maximize", load_if_exists=True)
+    except Exception as error:  # Optuna promises none of its own for a damaged file
+        raise SettingsError(f"{file} is damaged ({type(error).__name__}): choose another --folder") from None
 
 
 def score(run: PlannedRun) -> float:
@@ -188,9 +216,9 @@ def _distribution(axis: Axis) -> Any:
     return distributions.FloatDistribution(axis.low, axis.high, log=axis.log)
 
 
-def _written(axis: Axis, value: Any) -> str:
-    return value if isinstance(axis, Choices) else axis.written(value)
-
-
-def _read_value(axis: Axis, text: str) -> Any:
-    return text if isinstance(axis, Choices) else int(text) if axis.whole else float(text)
+def _written(distribution: Any, value: Any) -> str:
+    """Return a value that Optuna chose, as it is written after `=`."""
+    if isinstance(value, str):
+        return value
+    low, high, whole = distribution.low, distribution.high, isinstance(value, int)
+    return Range(key="", low=low, high=high, whole=whole).written(value)

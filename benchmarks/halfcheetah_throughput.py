@@ -26,8 +26,8 @@ from benchmarks.running import learning_rate, machine, per_call, table
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.make import make_environments
 from daedalus.learner.run.default_settings import default_settings
+from daedalus.learner.run.process_resources import keep_freed_memory
 from daedalus.learner.run.settings import run_spec
-from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.runtime import OnnxRuntime

@@ -24,7 +24,7 @@ import torch
 
 from benchmarks.running import machine, table
 from daedalus.algorithms.forward import FlatParameters
-from daedalus.learner.training.allocator import keep_freed_memory
+from daedalus.learner.run.process_resources import keep_freed_memory
 from daedalus.learner.training.optimizers import Adam
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces

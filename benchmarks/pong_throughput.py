@@ -23,8 +23,8 @@ from benchmarks.learner_speed import NETWORKS, fastest, updater
 from benchmarks.random_actions import random_actions
 from benchmarks.running import learning_rate, machine, per_call, table
 from daedalus.actor.environments.make import make_environments
+from daedalus.learner.run.process_resources import keep_freed_memory
 from daedalus.learner.run.settings import read_preset, run_spec
-from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.learner.run.settings import read_preset, run_spec
 from daedalus.protocol.spec import EnvironmentSpec
 

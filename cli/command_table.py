@@ -1,10 +1,45 @@
-"""The commands of `daedalus`, in the order of its help, and where their code is. Imports none of them."""
+"""The commands of `daedalus`: its help, and where their code is, in the same order. Imports none of them."""
 
 import argparse
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
+USAGE = """\
+usage: daedalus COMMAND ...
+
+Actor-critic reinforcement learning with one learner and any number of actors, on any machines.
+
+on this machine:
+  train      start a learner and actors, show their progress, evaluate the result
+  resume     continue a run from its newest checkpoint
+  sweep      train runs of several settings and seeds, and compare them
+  check      play an environment with random actions, and report its faults, its speed and what train would choose
+  settings   print the settings of a run with their defaults, limits and meanings
+
+on several machines, one process at a time:
+  learner    own the weights, and train them on the rollouts of actors
+  actor      play environments for a learner; needs only its address
+  router     connect learner and actors at a fixed address
+  status     show the state of a learner and its actors
+  drain      ask actors to leave after their current rollout
+  gateway    show a run on a web page, and connect actors in any language
+  exporter   export the status as Prometheus metrics
+  certs      create certificates for encrypted connections
+
+after training:
+  evaluate   play episodes with the policy of a run, or record a video
+  plot       draw the learning curves of one or more runs
+  compare    print a table of groups of runs, with intervals
+  report     write one HTML file about one or more runs
+  push       upload the policy of a run to the Hugging Face Hub
+
+for the shell:
+  completion print a script that completes commands, options and presets
+
+`daedalus COMMAND --help` describes a command, and `daedalus --version` prints the version.
+To start: daedalus train cartpole"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from daedalus.cli.arguments import whole_number
 from daedalus.launch.run_choice import NewRun, RunChoice
-from daedalus.learner.reporting.trackers.tracker import TRACKERS
+from daedalus.learner.reporting.trackers.tracker import TRACKERS, tracker_name
 from daedalus.learner.run.settings import preset_names
 from daedalus.protocol.algorithms import ALGORITHMS
 
@@ -78,10 +78,19 @@ def add_log(options: argparse._ActionsContainer) -> None:
         "--log",
         action="append",
         default=[],
-        choices=TRACKERS,
-        help="log the run to this tracker too, in addition to metrics.csv and TensorBoard. May be given several times. "
-        "`daedalus resume` continues the run there",
+        type=_tracker_name,
+        metavar="NAME",
+        help=f"log the run to this tracker too ({', '.join(TRACKERS)}), in addition to metrics.csv and TensorBoard, or "
+        "to a metrics writer of your own (module:Class). May be given several times. `daedalus resume` continues the "
+        "run at a tracker by itself",
     )
+
+
+def _tracker_name(name: str) -> str:
+    try:
+        return tracker_name(name)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def run_choice(arguments: argparse.Namespace) -> RunChoice:

@@ -32,7 +32,7 @@ PYTHON_API = {
     ),
     "Client": ("Client", "daedalus.actor.collecting.client_agent.ClientAgent"),
     "Transport": tuple(f"daedalus.transport.interface.{name}" for name in ("Transport", "Request", "Inbox")),
-    "Metrics": tuple(f"daedalus.learner.reporting.metrics.{name}" for name in ("MetricsWriter", "Details")),
+    "Metrics": tuple(f"daedalus.learner.reporting.metrics_rows.{name}" for name in ("MetricsWriter", "Details")),
 }
 
 

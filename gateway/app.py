@@ -10,8 +10,8 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
+from daedalus.gateway.client_gateway import MAX_CLIENTS, Gateway
 from daedalus.gateway.connection import ClientConnection
-from daedalus.gateway.gateway import MAX_CLIENTS, Gateway
 from daedalus.gateway.places import Places, most_connections
 from daedalus.gateway.security import HEADERS, Guard
 from daedalus.gateway.watching.page_data import PageData

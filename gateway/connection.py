@@ -10,8 +10,8 @@ from typing import Any
 from daedalus.gateway import client_messages
 from daedalus.gateway.channel import channel_of
 from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.client_gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.client_messages import TRANSITIONS, Act, ClientError, EndEpisode, Hello, Reward, State
-from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import Guard, RateLimit
 

@@ -14,8 +14,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from daedalus.gateway.app import application
+from daedalus.gateway.client_gateway import Gateway, GatewayConfig
 from daedalus.gateway.client_messages import ClientError
-from daedalus.gateway.gateway import Gateway, GatewayConfig
 from daedalus.gateway.security import LOOPBACK, OperatorToken, Tokens, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.watching.camera import CameraProcess

@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.algorithms.errors import AlgorithmError
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.confirmation import Confirmations
 from daedalus.launch.environment_check import expected_defaults, expected_spaces
@@ -33,18 +32,23 @@ from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.changes import differing, fixed_changes
-from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
-from daedalus.learner.run.initial import allows_other_spaces, initial_to_resume
+from daedalus.learner.run.resuming import (
+    CheckpointMismatchError,
+    allows_other_spaces,
+    differing,
+    finished_run,
+    fixed_changes,
+    initial_to_resume,
+)
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.serving.rollout_intake import largest_request
-from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import NetworkError, UserModules, allow_settings, allow_words, modules_of, shown_path
+from daedalus.protocol.algorithms import AlgorithmError
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.addresses import reachable

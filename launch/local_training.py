@@ -36,8 +36,8 @@ from daedalus.launch.supervision import (
 )
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.run_directory import OPERATOR_TOKEN
+from daedalus.learner.serving.events import EventFile
 from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)

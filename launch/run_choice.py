@@ -9,7 +9,7 @@ from typing import Any
 from daedalus.launch.environment_check import checked_defaults, checked_spaces, transformed_spaces
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
-from daedalus.learner.run.initial import check_initial
+from daedalus.learner.run.resuming import check_initial
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import (
     SettingsError,
@@ -162,8 +162,8 @@ def with_record(spec: RunSpec, modules: UserModules) -> RunSpec:
     """
     if not spec.training.user_modules:
         return spec
-    from daedalus.algorithms.errors import AlgorithmError
     from daedalus.algorithms.own_algorithm import own_class  # torch, which other runs do not need here
+    from daedalus.protocol.algorithms import AlgorithmError
 
     settings = spec.model_dump()
     try:

@@ -20,9 +20,11 @@ from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.logs import configure_logging, say
 from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.launch.supervision import start
-from daedalus.learner.reporting.trackers.tracker import TRACKERS, is_installed, tracker_class
+from daedalus.learner.reporting.trackers.tracker import is_installed, tracker_class, tracker_name
 from daedalus.learner.reporting.trackers.tracking import Tracking
 from daedalus.learner.run.run_directory import run_name
+from daedalus.policy.user_code import first_line, place_of
+from daedalus.policy.user_modules import UserModuleError
 
 _END_SECONDS = 60.0  # after the end of the run; a parent that lives ends this process before
 
@@ -30,7 +32,7 @@ _END_SECONDS = 60.0  # after the end of the run; a parent that lives ends this p
 def main() -> int:
     """Run the process and return its exit status."""
     options = argparse.ArgumentParser()
-    options.add_argument("name", choices=TRACKERS)
+    options.add_argument("name", type=tracker_name)
     options.add_argument("directory", type=Path)
     options.add_argument("--service", action="store_true")
     options.add_argument("--log-json", action="store_true")
@@ -41,7 +43,13 @@ def main() -> int:
     finish = stop_on_signals()
     exit_with_parent(finish)
     threading.Thread(target=_end_in_time, args=(finish,), name="end", daemon=True).start()
-    done = Tracking(parsed.name, parsed.directory, tracker_class(parsed.name), finish).run()
+    try:
+        open_tracker = tracker_class(parsed.name)
+    except Exception as error:  # the user's module may raise anything
+        fault = str(error) if isinstance(error, UserModuleError) else f"{first_line(error)}{place_of(error)}"
+        _logger.warning("%s: %s; the run goes on without it", parsed.name, fault)
+        return 1
+    done = Tracking(parsed.name, parsed.directory, open_tracker, finish).run()
     os._exit(0 if done else 1)  # packages of trackers wait for the network at the end of the interpreter
 
 

@@ -18,7 +18,7 @@ from daedalus.launch.local_run import LocalRun, RunEnd, RunFailedError, UnsavedE
 from daedalus.launch.local_training import run_locally
 from daedalus.launch.logs import LineHandler, say
 from daedalus.launch.run_choice import NewRun, RunChoice, create_run
-from daedalus.learner.reporting.trackers.tracker import TRACKERS
+from daedalus.learner.reporting.trackers.tracker import tracker_name
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import refuse_while_imported
@@ -88,7 +88,8 @@ def train(
       init_from: another run, or one of its checkpoints, whose weights to begin with, of equal network and spaces.
       allow_other_spaces: accept `init_from` of other spaces: the weights are loaded if their shapes fit.
       callback: called with each row of metrics; it can log metrics of its own and end training.
-      log: trackers to log the run to, of "wandb", "mlflow" and "trackio".
+      log: trackers to log the run to, of "wandb", "mlflow" and "trackio", or "module:Class" for a metrics writer of
+        your own.
       quiet: print nothing.
 
     Raises SettingsError for invalid settings, TypeError for an argument of another type, TrainingError if a process
@@ -99,8 +100,10 @@ def train(
     preset = str(preset) if isinstance(preset, Path) else preset
     _check_types(preset, env, callback, settings)
     log = (log,) if isinstance(log, str) else log
-    if unknown := set(log) - set(TRACKERS):
-        raise SettingsError(f"log: unknown tracker {sorted(unknown)[0]!r}: choose from {', '.join(TRACKERS)}")
+    try:
+        log = [tracker_name(name) for name in log]
+    except ValueError as error:
+        raise SettingsError(f"log: {error}") from None
     choice = RunChoice(
         preset=preset,
         env=env,

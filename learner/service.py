@@ -14,19 +14,16 @@ from typing import TYPE_CHECKING
 
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
-from daedalus.learner.reporting.run_records import RunRecords, continue_records
-from daedalus.learner.reporting.run_reporter import RunReporter
+from daedalus.learner.reporting.run_reporter import RunRecords, RunReporter, continue_records
 from daedalus.learner.reporting.user_metrics import UserMetrics
-from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.heartbeat import Heartbeat
-from daedalus.learner.run.initial import other_network, other_spaces
-from daedalus.learner.run.rollout_length import check_rollout_length
+from daedalus.learner.run.resuming import CheckpointMismatchError, other_network, other_spaces
 from daedalus.learner.run.run_state import RunState
-from daedalus.learner.run.settings import unmeasured_target
+from daedalus.learner.run.settings import check_rollout_length, unmeasured_target
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.orders import Orders
+from daedalus.learner.serving.events import EventFile
+from daedalus.learner.serving.query_responses import Orders
 from daedalus.learner.target_confirmation import TargetConfirmation
-from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules, shown_path
 from daedalus.protocol.messages import RunStatus

@@ -17,6 +17,10 @@ Heads = Literal["policy_and_value", "action_values"]
 Epsilons = Annotated[tuple[UnitInterval, ...], Field(min_length=1, max_length=64)]
 
 
+class AlgorithmError(Exception):
+    """Error of an algorithm that cannot be used in a run. The message is one line."""
+
+
 class ActorDemands(Specification):
     """What one algorithm demands of actors."""
 

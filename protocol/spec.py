@@ -312,7 +312,7 @@ class TrainingSpec(LossSpec):
     def exploration_annealing(self, progress: float, env_steps: int) -> float:
         """Return how much of epsilon's way from 1 to its final value is left, from 1 to 0.
 
-        `progress` is the share of the budget that is used (learner/run/annealing.py), and `env_steps` their number.
+        `progress` is the share of the budget that is used (learner/run/counters.py), and `env_steps` their number.
         """
         if self.exploration_env_steps is None:
             used, end = progress, self.record.exploration_share

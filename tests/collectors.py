@@ -7,7 +7,7 @@ from allowed_modules import TEST_MODULES
 
 from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.messages import Snapshot

@@ -14,7 +14,7 @@ from processes import LIMIT
 from websockets.sync.client import ClientConnection, connect
 
 from daedalus.gateway.app import application
-from daedalus.gateway.gateway import Gateway, GatewayConfig
+from daedalus.gateway.client_gateway import Gateway, GatewayConfig
 from daedalus.gateway.security import LOOPBACK, OperatorToken, Tokens, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.watching.page_data import PageData

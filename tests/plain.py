@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces

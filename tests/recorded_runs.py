@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.run.run_directory import METRICS, create
 from daedalus.learner.run.settings import override, read_preset, run_spec
 

@@ -11,7 +11,7 @@ from processes import LIMIT
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.session.config import ActorConfig, LinkChoice
 from daedalus.actor.session.service import ActorService
-from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
+from daedalus.learner.serving.snapshot_publisher import CompactSnapshotCache
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
@@ -409,11 +410,10 @@ def evaluated(directory: Path, seed: int) -> tuple[float, int]:
     saved = find_policy(directory)
     runtime = OnnxRuntime(saved.program)
     runtime.load(saved.weights)
-    environments = make_environments(saved.spec.environment.as_evaluated("gymnasium"), 1, one_episode=True)
-    try:
+    with closing(
+        make_environments(saved.spec.environment.as_evaluated("gymnasium"), 1, one_episode=True)
+    ) as environments:
         evaluation = play_episodes(runtime, environments, 1, seed, sampled=False)
-    finally:
-        environments.close()
     return float(evaluation.returns[0]), int(np.random.SeedSequence(seed).generate_state(1)[0]) % 2**30
 
 
@@ -440,11 +440,8 @@ def test_the_pretrained_policy_plays_gymnasiums_car_racing() -> None:
     saved = find_policy(pretrained("car_racing"))
     runtime = OnnxRuntime(saved.program)
     runtime.load(saved.weights)
-    environments = make_environments(own, 1)
-    try:
+    with closing(make_environments(own, 1)) as environments:
         expected = play_episodes(runtime, environments, 1, 5, sampled=False).returns[0]
-    finally:
-        environments.close()
     seed = int(np.random.SeedSequence(5).generate_state(1)[0])
     kwargs: dict[str, Any] = dict(environment.kwargs)
     car = gymnasium.make(environment.id, max_episode_steps=limit, **kwargs)

@@ -25,10 +25,10 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import make_single, uses_vector_entry_point
 from daedalus.actor.environments.gymnasium_environments import limited_close
 from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks
-from daedalus.actor.environments.interface import BackendEnvironments, Observed
 from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
+from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace, Spaces, unfit_number

@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
-from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.environments.vector_environments import Observed
 from daedalus.actor.errors import ActorError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.spec import ActorSpec, EnvironmentSpec

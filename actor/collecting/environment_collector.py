@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.messages import Snapshot

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.actor.environments.interface import Observed
+from daedalus.actor.environments.vector_environments import Observed
 from daedalus.policy.acting.noise import Noise, draw_noise
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
@@ -29,35 +29,30 @@ class EpisodeCounter:
     def __init__(self, count: int) -> None:
         self._returns = np.zeros(count, np.float64)
         self._lengths = np.zeros(count, np.int32)
-        self._ended = np.zeros(count, np.bool_)
+        self.ended = np.zeros(count, np.bool_)  # [E] whether the next step is the reset after an episode's end
         self._finished: list[tuple[np.ndarray, np.ndarray]] = []
 
-    @property
-    def valid(self) -> np.ndarray:
-        """[E] bool: whether the next step is a real one and not the reset after an episode's end."""
-        return ~self._ended
-
-    def step(self, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> None:
-        """Count one row: unscaled rewards [E], terminated [E], truncated [E]."""
+    def step(self, rewards: np.ndarray, valid: np.ndarray, ended: np.ndarray) -> None:
+        """Count one row: unscaled rewards, whether it is no reset row, and whether the episode ends; all [E]."""
         self._returns += rewards
-        self._lengths += ~self._ended
-        self._ended = terminated | truncated
-        if self._ended.any():
-            self._finished.append((self._returns[self._ended], self._lengths[self._ended]))
-            self._returns[self._ended] = 0.0
-            self._lengths[self._ended] = 0
+        self._lengths += valid
+        self.ended = ended
+        if np.count_nonzero(self.ended):
+            self._finished.append((self._returns[self.ended], self._lengths[self.ended]))
+            self._returns[self.ended] = 0.0
+            self._lengths[self.ended] = 0
 
     def cut(self) -> None:
         """Note that all episodes ended with the row that was counted last."""
         self._finished.append((self._returns.copy(), self._lengths.copy()))
         self.restart()
-        self._ended[:] = True
+        self.ended[:] = True
 
     def restart(self) -> None:
         """Forget the running episodes: others begin."""
         self._returns[:] = 0.0
         self._lengths[:] = 0
-        self._ended[:] = False
+        self.ended[:] = False
 
     def take_finished(self) -> FinishedEpisodes:
         """Return the episodes that ended since the last call."""
@@ -189,7 +184,8 @@ class RolloutWriter:
 
     def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
         """Write what VectorEnvironment.step returned for those actions; return whether the rollout is full."""
-        row, valid = self._row, self._episodes.valid
+        row, resets = self._row, self._episodes.ended
+        valid = ~resets
         for name, frames in self._frames.items():
             frames[self._depths[name] + row] = observed.frames[name]
         self._rewards[row] = rewards
@@ -197,12 +193,13 @@ class RolloutWriter:
         self._truncated[row] = truncated
         self._valid[row] = valid
         # The row after a reset row is the first of its episode: its frame stack and memory begin anew.
-        self._stacks.push(observed.frames, ~valid)
+        self._stacks.push(observed.frames, resets)
         self._current_masks = observed.masks
-        # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
-        goes_on = valid & np.isfinite(self._next_state).all(axis=1)
-        self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
-        self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
+        if self._state.size:
+            # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
+            goes_on = valid & np.isfinite(self._next_state).all(axis=1)
+            self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
+        self._episodes.step(self._rewards[row], valid, self._terminated[row] | self._truncated[row])
         self._row += 1
         return self._row == len(self._rewards)
 

@@ -314,7 +314,8 @@ class ActionComponents:
     def _env_action(self, leaf: Leaf, values: np.ndarray) -> np.ndarray:
         match leaf.space:
             case gym.Discrete() as space:
-                return (values[:, 0] + space.start).astype(space.dtype)
+                choices = values[:, 0] + space.start if space.start else values[:, 0]
+                return choices.astype(space.dtype)
             case gym.MultiDiscrete() as space:
                 return (values + space.start.ravel()).reshape(len(values), *space.shape).astype(space.dtype)
             case gym.Box():

@@ -23,7 +23,7 @@ from daedalus.actor.environments.environment_errors import (
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
-from daedalus.actor.environments.interface import BackendStep
+from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.actor.environments.wrappers import OfItsSpace
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import USER_STATE

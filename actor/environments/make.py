@@ -1,8 +1,8 @@
 """Creates environments from their specification."""
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import BackendEnvironments, VectorEnvironment
 from daedalus.actor.environments.transforms import TransformedEnvironment
+from daedalus.actor.environments.vector_environments import BackendEnvironments, VectorEnvironment
 from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec

@@ -18,8 +18,8 @@ from daedalus.actor.environments.components import (
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.info import MASK_KEY, Masks, ObservedMasks, mask_of_one
-from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
 from daedalus.actor.environments.pixels import Pixels
+from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed, Step
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -168,7 +168,7 @@ class TransformedEnvironment:
         """See VectorEnvironment."""
         observations, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
         ended = terminated | truncated
-        if self._ended.any():
+        if np.count_nonzero(self._ended):  # a tenth of the time of any()
             rewards = self._rewards_of_steps(rewards, ended)
         self._ended = ended
         if self._one_episode:
@@ -184,15 +184,14 @@ class TransformedEnvironment:
         own account and a real one by ours.
         """
         resets = self._ended
-        if (ended & resets).any():
+        if np.count_nonzero(ended & resets):
             number = np.flatnonzero(ended & resets)[0]
             raise EnvironmentSetupError(
                 f"environment {self._name}: environment {number} ends an episode in the step "
                 "after an episode's end, which only resets (AutoresetMode.NEXT_STEP): return terminated and truncated "
                 "False there"
             )
-        ignored = rewards[resets & (rewards != 0.0)]
-        if len(ignored) and not self._warned_of_rewards:
+        if not self._warned_of_rewards and len(ignored := rewards[resets & (rewards != 0.0)]):
             self._warned_of_rewards = True
             _logger.warning(
                 "environment %s: it gives the reward %g in a step that only resets after an episode's end "

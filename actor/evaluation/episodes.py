@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import Observed, VectorEnvironment
+from daedalus.actor.environments.vector_environments import Observed, VectorEnvironment
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime

@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.learner_queries import LearnerQueries

@@ -11,8 +11,8 @@ import numpy as np
 from daedalus.actor.environments.atari import pools_frames
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium, make_gymnasium
-from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.environments.vector_environments import Observed
 from daedalus.actor.evaluation.episodes import RunningEpisodes
 from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import OnnxRuntime

@@ -45,9 +45,9 @@ def make_upload_maker(spec: ActorSpec, spaces: Spaces, modules: UserModules) -> 
     try:
         learning = spec.learning_settings
         modules.check(learning.user_modules)
-        from daedalus.algorithms.errors import AlgorithmError
         from daedalus.algorithms.rollout_gradients import RolloutGradients
         from daedalus.policy.user_modules import NetworkError
+        from daedalus.protocol.algorithms import AlgorithmError
     except (UnsupportedRunError, UserModuleError) as error:
         raise ActorError(str(error)) from None
     except ModuleNotFoundError as error:

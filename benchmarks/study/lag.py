@@ -44,7 +44,7 @@ class Cell:
 def run(cell: Cell) -> dict[str, Any]:
     """Make a run; return its line of the file."""
     from benchmarks.study.exact_lag import train
-    from daedalus.learner.training.allocator import keep_freed_memory
+    from daedalus.learner.run.process_resources import keep_freed_memory
 
     keep_freed_memory()
     began = time.monotonic()

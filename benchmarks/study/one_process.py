@@ -7,9 +7,8 @@ import numpy as np
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.algorithms.rollout_gradients import RolloutGradients
-from daedalus.learner.run.annealing import Annealing
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.gradient_checks import restored
+from daedalus.learner.run.counters import Annealing, RunCounters
+from daedalus.learner.serving.upload_checks import restored
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.codec import decode, encode

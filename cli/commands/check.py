@@ -163,12 +163,12 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     """Return a description of the network, and an empty string; or an empty string, and why it cannot be learned."""
     if spaces is None:
         return "", ""
-    from daedalus.algorithms.errors import AlgorithmError
     from daedalus.algorithms.gradients import GradientComputer
     from daedalus.policy.acting.program import export_program
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
     from daedalus.policy.user_modules import NetworkError
+    from daedalus.protocol.algorithms import AlgorithmError
 
     try:
         network = ActorCritic(spec.policy, spaces, modules, spec.training)

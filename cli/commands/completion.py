@@ -7,6 +7,7 @@ import shtab
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.command_table import COMMANDS
+from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run.settings import preset_names
 from daedalus.protocol.algorithms import ALGORITHMS
 
@@ -52,6 +53,8 @@ def _complete(action: argparse.Action) -> None:
         action.choices = preset_names()
     elif action.dest == "algorithm":
         action.choices = tuple(ALGORITHMS)
+    elif action.dest == "log":
+        action.choices = TRACKERS
     elif action.type is Path:
         folder = action.metavar in ("DIR", "RUN_DIR")
         vars(action)["complete"] = shtab.DIRECTORY if folder else shtab.FILE

@@ -29,9 +29,8 @@ from daedalus.launch.process_lifecycle import (
     stop_on_signals,
 )
 from daedalus.learner.reporting.user_metrics import UserMetrics
-from daedalus.learner.run.descriptors import reserve_descriptors
+from daedalus.learner.run.process_resources import keep_freed_memory, reserve_descriptors
 from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
 from daedalus.protocol.spaces import Spaces

@@ -89,9 +89,15 @@ def sweep(arguments: list[str]) -> int:
     try:
         axes = _axes(parsed)
         folder = parsed.folder or _default_folder(parsed, axes)
-        search = _search(parsed, axes, folder)
+        if parsed.sampler:
+            import_optuna()  # before the check, which takes seconds
+        planner, seeds = _planner(parsed, folder)
+        search: Search | None = None
+        if not parsed.sampler:  # before the folder is made: the settings may be invalid
+            search = GridSearch(planner, [axis for axis in axes if isinstance(axis, Choices)], seeds)
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
+            search = search or SampledSearch(planner, axes, seeds, trials=parsed.trials or 20, folder=folder)
             _record(folder, parsed)
             return _run(search, folder, axes, parsed, arguments)
     except ModuleNotFoundError as error:
@@ -143,24 +149,18 @@ def _default_folder(parsed: argparse.Namespace, axes: Sequence[Axis]) -> Path:
     return Path("sweeps") / "-".join(re.sub(r"[^\w.]+", "-", word).strip("-.") for word in words if word)
 
 
-def _search(parsed: argparse.Namespace, axes: Sequence[Axis], folder: Path) -> Search:
-    """Check the environment, and return the search.
+def _planner(parsed: argparse.Namespace, folder: Path) -> tuple[Planner, range]:
+    """Check the environment, and return the planner of the runs, and their seeds.
 
-    Raises SettingsError, EnvironmentProblemError, ModuleNotFoundError.
+    Raises SettingsError, EnvironmentProblemError.
     """
-    if parsed.sampler:
-        import_optuna()  # before the check, which takes seconds
     choice, defaults = run_choice(parsed), None
-    spec = choice.spec()
-    if parsed.env is None:
-        checked_spaces(spec, fork=True)
+    if choice.env is None:
+        checked_spaces(choice.spec(), fork=True)
     else:
-        _, defaults = checked_defaults(spec, fork=True)
+        _, defaults = checked_defaults(choice.spec(), fork=True)
     first = choice.spec(defaults).training.seed
-    seeds, planner = range(first, first + parsed.seeds), Planner(choice, parsed.log, folder, defaults)
-    if parsed.sampler:
-        return SampledSearch(planner, axes, seeds, trials=parsed.trials or 20, folder=folder)
-    return GridSearch(planner, [axis for axis in axes if isinstance(axis, Choices)], seeds)
+    return Planner(choice, parsed.log, folder, defaults), range(first, first + parsed.seeds)
 
 
 def _locked(folder: Path) -> RunLock:

@@ -45,9 +45,7 @@ from daedalus.launch.process_lifecycle import (
 from daedalus.launch.run_choice import create_run, with_record
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.changes import with_changes
-from daedalus.learner.run.finished import finished_run
-from daedalus.learner.run.initial import initial_to_resume
+from daedalus.learner.run.resuming import finished_run, initial_to_resume, with_changes
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints

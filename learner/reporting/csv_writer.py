@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daedalus.learner.reporting.metrics import COLUMNS, Details
-from daedalus.learner.reporting.metrics_file import lasting, numbers
+from daedalus.learner.reporting.metrics_rows import COLUMNS, Details, lasting, numbers
 from daedalus.policy.saving.regular_files import append_own, replacing
 from daedalus.protocol.texts import exact_number
 

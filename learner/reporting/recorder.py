@@ -10,9 +10,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from daedalus.learner.reporting.metrics import Details, MetricsWriter
+from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter
 from daedalus.learner.reporting.progress import Progress
-from daedalus.learner.run.descriptors import reserved_descriptors
+from daedalus.learner.run.process_resources import reserved_descriptors
 
 _QUEUED_ROWS = 256  # further rows are dropped
 _RETRY_SECONDS = 10.0  # after a writer failed

@@ -1,21 +1,205 @@
 """Metrics rows, status and summary of one run, from its counters, fleet and health."""
 
+import logging
 import math
 import threading
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daedalus.learner.reporting.episode_hint import EpisodeHint
-from daedalus.learner.reporting.learning_hint import LearningHint
-from daedalus.learner.reporting.metrics import Details
-from daedalus.learner.reporting.rates import RateMeter
-from daedalus.learner.reporting.report import metrics_row, run_status, summary
+import numpy as np
+
+from daedalus.learner.reporting.csv_writer import cut_rows
+from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint
+from daedalus.learner.reporting.metrics_rows import ENV, Details, MetricsHistory, read_rows
+from daedalus.learner.reporting.recorder import Recorder
+from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.user_metrics import UserMetrics
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.health import Health
+from daedalus.learner.run.run_directory import EVALUATION, METRICS, SUMMARY, read_json, write_json
 from daedalus.learner.run.run_state import RunState
+from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.serving.events import RESUMED, EventLog
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.query_responses import page, totals
+from daedalus.policy.saving.best_checkpoints import set_aside_newer
 from daedalus.protocol.messages import RunStatus
+from daedalus.protocol.spec import RunSpec
 
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
+
+
+def episode_statistics(counters: RunCounters) -> dict[str, float]:
+    """Return statistics of the newest training episodes; empty before the first episode."""
+    if not counters.returns:
+        return {}
+    returns = np.array(counters.returns)
+    return {
+        "episode_return_mean": float(returns.mean()),
+        "episode_return_std": float(returns.std()),
+        "episode_return_min": float(returns.min()),
+        "episode_return_max": float(returns.max()),
+        "episode_length_mean": float(np.mean(counters.lengths)),
+    }
+
+
+def metrics_row(
+    counters: RunCounters,
+    fleet: Fleet,
+    rates: dict[str, float],
+    learning: dict[str, float],
+    wall_seconds: float,
+) -> dict[str, float]:
+    """Return one metrics row, with columns of learner/reporting/metrics_rows.py and the scalars of the environment.
+
+    Args:
+      counters: counters of the run.
+      fleet: the actors.
+      rates: result of `RateMeter.measure`.
+      learning: metrics of the updates and of the newest evaluation.
+      wall_seconds: duration of the run.
+    """
+    return {
+        "wall_seconds": wall_seconds,
+        "env_steps": counters.env_steps,
+        "updates": counters.updates,
+        "episodes": counters.episodes,
+        **episode_statistics(counters),
+        **rates,
+        "policy_lag_max": counters.policy_lag_max,
+        "actors": len(fleet.live),
+        "rollouts_accepted": counters.rollouts_accepted,
+        "rollouts_rejected": counters.rollouts_rejected.total(),
+        "updates_skipped": counters.updates_skipped,
+        **learning,
+        **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
+    }
+
+
+def run_status(
+    run: str,
+    learner_epoch: int,
+    spec: RunSpec,
+    counters: RunCounters,
+    fleet: Fleet,
+    rates: dict[str, float],
+    health: Health,
+    queue_bytes: int,
+    now: float,
+) -> RunStatus:
+    """Return the status of the run with its first actors. `now` is on the monotonic clock, in seconds."""
+    fleet.forget_absent(now)
+    return RunStatus(
+        run=run,
+        learner_epoch=learner_epoch,
+        algorithm=spec.training.algorithm,
+        environment=spec.environment.id,
+        problems=health.problems(now, len(fleet.live)),
+        uptime_seconds=now - health.started,
+        env_steps=counters.env_steps,
+        env_steps_budget=spec.training.env_steps,
+        updates=counters.updates,
+        updates_skipped=counters.updates_skipped,
+        episode_return_mean=counters.episode_return_mean,
+        env_steps_per_second=rates.get("env_steps_per_second", 0.0),
+        updates_per_second=rates.get("updates_per_second", 0.0),
+        policy_lag_mean=rates.get("policy_lag_mean", 0.0),
+        queue_bytes=queue_bytes,
+        queue_bytes_limit=spec.service.queue_bytes,
+        checkpoint_age_seconds=None if health.saved is None else now - health.saved,
+        certificate_days_left=health.certificate_days_left(),
+        rollouts_accepted=counters.rollouts_accepted,
+        rollouts_rejected=dict(counters.rollouts_rejected),
+        **totals(fleet),
+        refused_joins=fleet.refused_joins.report(now),
+        actors=page(fleet, "", now),
+    )
+
+
+def summary(
+    run: str,
+    spec: RunSpec,
+    counters: RunCounters,
+    *,
+    finished: bool,
+    wall_seconds: float,
+    env_steps_per_second: float,
+) -> dict[str, Any]:
+    """Return the content of summary.json at the end of training. A final evaluation adds its results later."""
+    return {
+        "run": run,
+        "algorithm": spec.training.algorithm,
+        "environment": spec.environment.id,
+        "seed": spec.training.seed,
+        "solved": counters.seconds_to_target is not None,
+        "finished": finished,
+        "env_steps": counters.env_steps,
+        "updates": counters.updates,
+        "updates_skipped": counters.updates_skipped,
+        "episodes": counters.episodes,
+        "wall_seconds": wall_seconds,
+        "seconds_to_target": counters.seconds_to_target,
+        "env_steps_per_second": env_steps_per_second,
+        "episode_return_mean": counters.episode_return_mean,
+        "evaluation_return_mean": None,
+        "evaluation_return_std": None,
+        "confirmation_return_mean": None,
+        "policy_lag_mean": counters.policy_lag_mean,
+        "policy_lag_max": counters.policy_lag_max,
+        "rollouts_accepted": counters.rollouts_accepted,
+        "rollouts_rejected": dict(counters.rollouts_rejected),
+        "rollout_bytes_per_env_step": counters.rollout_bytes / max(counters.accepted_env_steps, 1),
+        "snapshots_published": counters.snapshots_published,
+    }
+
+
+class RateMeter:
+    """Rates since the last measurement."""
+
+    def __init__(self, counters: RunCounters, now: float) -> None:
+        self.rates: dict[str, float] = {}  # of the last measurement
+        self._actors: dict[str, tuple[int, int, int]] = {}  # env_steps, received bytes, answered bytes
+        self._pushed_bytes = 0
+        self._begun, self._first_env_steps, self._first_rollouts = now, counters.env_steps, counters.rollouts_trained
+        self._mark(counters, now)
+
+    def overall(self, counters: RunCounters, now: float) -> float:
+        """Return env_steps per second since construction."""
+        return (counters.env_steps - self._first_env_steps) / max(now - self._begun, 1e-9)
+
+    def _mark(self, counters: RunCounters, now: float) -> None:
+        self._then, self._env_steps, self._updates = now, counters.env_steps, counters.updates
+        self._rollouts, self._lag = counters.rollouts_trained, counters.policy_lag_sum
+
+    def measure(self, counters: RunCounters, fleet: Fleet, now: float, *, last: bool = False) -> dict[str, float]:
+        """Return env_steps and updates per second and the mean policy lag, since the last measurement.
+
+        What is unknown is absent: all of it before the first batch, and the policy lag of no batch. The `last` interval
+        of a run ends at any moment: without a batch in it, nothing is known. Also sets the rates of each actor in
+        `fleet`. `now` is on the monotonic clock, in seconds.
+        """
+        seconds = max(now - self._then, 1e-9)
+        pushed, self._pushed_bytes = fleet.pushed_bytes - self._pushed_bytes, fleet.pushed_bytes
+        for actor in fleet.actors.values():
+            totals = actor.env_steps, actor.received_bytes, actor.answered_bytes
+            env_steps, received, answered = np.subtract(totals, self._actors.get(actor.name, (0, 0, 0))) / seconds
+            self._actors[actor.name] = totals
+            subscribed = 0.0 if actor.fetches or not fleet.is_live(actor) else pushed / seconds
+            actor.env_steps_per_second = float(env_steps)
+            actor.bytes_up_per_hour = 3600 * float(received)
+            actor.bytes_down_per_hour = 3600 * float(answered + subscribed)
+        self._actors = {name: self._actors[name] for name in fleet.actors}  # without evicted actors
+        rollouts = counters.rollouts_trained - self._rollouts
+        self.rates = {}
+        if rollouts or (counters.rollouts_trained > self._first_rollouts and not last):
+            self.rates["env_steps_per_second"] = (counters.env_steps - self._env_steps) / seconds
+            self.rates["updates_per_second"] = (counters.updates - self._updates) / seconds
+        if rollouts:
+            self.rates["policy_lag_mean"] = (counters.policy_lag_sum - self._lag) / rollouts
+        self._mark(counters, now)
+        return self.rates
 
 
 _DETAILS_SECONDS = 10.0  # between details: they take far more space than a row
@@ -102,3 +286,93 @@ class RunReporter:
             wall_seconds=self._state.wall_seconds(now),
             env_steps_per_second=self._meter.overall(self._counters, now),
         )
+
+
+_logger = logging.getLogger(__name__)
+
+
+class RunRecords:
+    """Writer of the records of one run during training, from construction to `close`."""
+
+    def __init__(self, state: RunState, reporter: RunReporter, history: MetricsHistory, recorder: Recorder) -> None:
+        """Construct the writer.
+
+        Args:
+          state: names the directory.
+          reporter: source of the rows and of the summary.
+          history: receives each row, for operators who watch the run.
+          recorder: writes the rows; it is closed with the records.
+        """
+        self._directory, self._reporter = state.directory, reporter
+        self._history, self._recorder = history, recorder
+        state.health.recording_since = lambda: recorder.busy_since
+
+    def record(self, learner: "Learner", now: float, *, last: bool = False) -> None:
+        """Record a row of metrics, and log a hint if one is due. `last` marks the row of a stop."""
+        row = self._reporter.row(learner, now, last=last)
+        self._history.add(row)
+        self._recorder.record(row, self._reporter.details(learner, now, last=last))
+        if not last and (hint := self._reporter.hint()):
+            _logger.warning("%s", hint)
+
+    def close(self) -> None:
+        """Write the queued rows."""
+        self._recorder.close()
+
+    def write_summary(self, *, finished: bool, ended: float, confirmation: dict[str, Any] | None) -> None:
+        """Write summary.json.
+
+        Args:
+          finished: whether the run is over, rather than stopped.
+          ended: when training ended, on the monotonic clock, in seconds.
+          confirmation: result of the new episodes that confirmed the target; None without them.
+        """
+        content = self._reporter.summary(finished=finished, now=ended)
+        if confirmation is not None:
+            content["confirmation"] = confirmation
+            content["confirmation_return_mean"] = confirmation["return_mean"]
+        try:
+            write_json(self._directory / SUMMARY, content)
+        except OSError as error:
+            _logger.warning("summary not written: %s", error.strerror)
+
+
+def continue_records(state: RunState, policy_version: int, history: MetricsHistory, events: EventLog) -> None:
+    """Undo what the learner processes before recorded after the checkpoint of this policy version; read the rest.
+
+    Rows of the metrics and best checkpoints of env_steps that the run makes again would be those of other weights.
+    Scores of episodes with another environment.max_episode_steps are no longer comparable.
+    """
+    directory, env_steps = state.directory, state.counters.env_steps
+    try:
+        rows = cut_rows(directory / METRICS, env_steps)
+        if rows:
+            writer = TensorBoardWriter(directory)
+            writer.purge(env_steps)
+            writer.close()
+            state.evaluations.carry_over(rows)
+        undone = [f"{len(rows):,} rows of {METRICS}"] if rows else []
+        comparable = -1 if state.other_episodes else policy_version  # the highest version whose score is
+        undone += [f"{each.name}, whose policy is kept" for each in set_aside_newer(directory, comparable)]
+        undone += _remove_later_results(directory, env_steps, policy_version)
+        if undone:
+            text = f"continues at {env_steps:,} env_steps: undone are {', '.join(undone)}"
+            events.add("checkpoint", f"{RESUMED}{text}")
+        for row in read_rows(directory / METRICS):
+            history.add(row)
+    except FileNotFoundError:
+        return  # no row yet
+    except (OSError, ValueError) as error:
+        _logger.warning("the metrics before the checkpoint cannot be read: %s", error)
+
+
+def _remove_later_results(directory: Path, env_steps: int, policy_version: int) -> list[str]:
+    """Remove the results of a run that had come further than the checkpoint, and return their names."""
+    removed = []
+    for name, key, reached in ((SUMMARY, "env_steps", env_steps), (EVALUATION, "policy_version", policy_version)):
+        with suppress(SettingsError):  # missing, or damaged: others say so
+            later = read_json(directory / name).get(key)
+            if isinstance(later, int) and later > reached:
+                (directory / name).unlink()
+                removed.append(name)
+    return removed

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.learner.reporting.metrics import Details, tag
+from daedalus.learner.reporting.metrics_rows import Details, tag
 from daedalus.policy.saving.regular_files import append_own
 
 _BINS = 30  # of returns and lengths

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping
 from contextlib import suppress
 
-from daedalus.learner.reporting.metrics import USER, Details
+from daedalus.learner.reporting.metrics_rows import USER, Details
 from daedalus.protocol.keys import is_name
 
 MOST_METRICS = 64  # between two rows

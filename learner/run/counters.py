@@ -1,4 +1,4 @@
-"""Counters and newest episodes of a run. State, saved with every checkpoint."""
+"""How far a run has come: annealed settings, and counters and newest episodes, which checkpoints save."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -8,9 +8,45 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
-from daedalus.learner.run.annealing import Annealing
 from daedalus.protocol.spec import RunSpec, TrainingSpec
-from daedalus.protocol.uploads import MAX_INFO_NAMES, Upload
+from daedalus.protocol.uploads import MAX_INFO_NAMES, Rollout, Upload
+
+
+class Annealing(BaseModel, frozen=True, strict=True, extra="forbid"):
+    """Progress of the annealed settings over the budget of a run, from 0 to 1.
+
+    The progress grows linearly from `progress` at `env_steps` to 1 at `budget`. A new run begins at 0. A run that is
+    resumed with another budget goes on from the progress that it had, so that no setting jumps back.
+    """
+
+    budget: int  # env_steps
+    env_steps: int = 0
+    progress: float = 0.0
+
+    def at(self, env_steps: int) -> float:
+        """Return the progress after so many env_steps of the run."""
+        remaining = self.budget - self.env_steps
+        if env_steps >= self.budget or remaining <= 0:
+            return 1.0
+        return self.progress + (1.0 - self.progress) * ((env_steps - self.env_steps) / remaining)
+
+    def resumed(self, env_steps: int, budget: int) -> "Annealing":
+        """Return the annealing of a run that is resumed after `env_steps` with a budget."""
+        if budget == self.budget:
+            return self
+        return Annealing(budget=budget, env_steps=env_steps, progress=self.at(env_steps))
+
+    def state(self) -> dict[str, Any]:
+        """Return the fields as plain JSON values."""
+        return self.model_dump()
+
+
+def updates_of(training: TrainingSpec, uploads: Sequence[Upload], *, memory: bool) -> int:
+    """Return the number of policy versions that a batch of these uploads makes; `memory`: the policy has one."""
+    if memory:  # gradients make one, whatever their number
+        return training.updates_from(sum(upload.environments for upload in uploads if isinstance(upload, Rollout)))
+    return training.updates_from(sum(upload.env_steps for upload in uploads))
+
 
 _SAVED = (
     "env_steps",

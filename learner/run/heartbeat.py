@@ -10,7 +10,7 @@ import threading
 import time
 from pathlib import Path
 
-from daedalus.learner.run.descriptors import reserved_descriptors
+from daedalus.learner.run.process_resources import reserved_descriptors
 from daedalus.policy.saving.regular_files import open_own, read_regular
 
 HEARTBEAT = "heartbeat"

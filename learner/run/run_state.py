@@ -4,11 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daedalus.learner.run.annealing import Annealing
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.evaluations import Evaluations
+from daedalus.learner.run.counters import Annealing, RunCounters
 from daedalus.learner.run.health import Health
 from daedalus.learner.run.run_directory import run_name
+from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.protocol.messages import new_epoch
 from daedalus.protocol.spec import RunSpec
 

@@ -19,6 +19,7 @@ from pydantic import JsonValue, ValidationError
 from daedalus.learner.run.run_files import RunDataError, read_toml
 from daedalus.learner.run.setting_errors import ambiguous, known_names, one_line, unknown_setting
 from daedalus.protocol.algorithms import check_algorithm
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 
 # Tables of arguments: their values have no type that would refuse a wrong one.
@@ -300,3 +301,12 @@ def as_toml(values: Any) -> Any:
     if isinstance(values, list):
         return [as_toml(value) for value in values]
     return {_NONE: True} if values is None else values
+
+
+def check_rollout_length(spec: RunSpec, spaces: Spaces) -> None:
+    """Raise SettingsError if no row would have the mask of the next one, which action values bootstrap with."""
+    if spec.algorithm.heads == "action_values" and spaces.masks and spec.collection.rollout_length < 2:
+        raise SettingsError(
+            f"collection.rollout_length is 1, but {spec.training.algorithm} needs the mask of the next row, and the "
+            "actions of this environment are masked: make it at least 2"
+        )

@@ -15,19 +15,16 @@ import time
 from collections.abc import Callable
 from types import MappingProxyType
 
+from daedalus.learner.reporting.metrics_rows import MetricsHistory
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.evaluation_queue import EvaluationQueue
+from daedalus.learner.serving.evaluations import EvaluationQueue
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.gradient_checks import Shapes
-from daedalus.learner.serving.metrics_history import MetricsHistory
-from daedalus.learner.serving.orders import Orders
-from daedalus.learner.serving.query_responses import QueryResponses
-from daedalus.learner.serving.requests import read_request
+from daedalus.learner.serving.query_responses import Orders, QueryResponses, StatusResponses, read_request
 from daedalus.learner.serving.rollout_intake import POLL_SECONDS, RolloutIntake
 from daedalus.learner.serving.session_watchdog import LOOK, SessionWatchdog
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
-from daedalus.learner.serving.status_responses import StatusResponses
+from daedalus.learner.serving.upload_checks import Shapes
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import (

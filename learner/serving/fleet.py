@@ -9,19 +9,299 @@ The lock of the actor server guards all of it.
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from daedalus.learner.serving.actor_state import Actor
-from daedalus.learner.serving.former_incarnations import Former, FormerIncarnations
-from daedalus.learner.serving.presence import Presence
-from daedalus.learner.serving.refused_joins import RefusedJoins, bounded
 from daedalus.protocol import keys
-from daedalus.protocol.messages import MAX_ENVIRONMENTS, ClientReport, Join, Refusal
+from daedalus.protocol.messages import MAX_ENVIRONMENTS, UNKNOWN, ClientReport, Join, Origin, Refusal, RefusedJoin
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.texts import bounded_text
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import RolloutIdentity
+
+_REORDERING = 1024  # largest distance of sequence numbers that arrive out of order
+
+
+@dataclass(slots=True)
+class SequenceWindow:
+    """Received sequence numbers of one incarnation. Each number is accepted at most once; gaps are counted."""
+
+    low: int = 0  # all numbers below were received or given up
+    gaps: int = 0  # numbers that were given up
+    _above: set[int] = field(default_factory=set)  # received numbers that are at least `low`
+
+    def __contains__(self, sequence: int) -> bool:
+        return sequence < self.low or sequence in self._above
+
+    def add(self, sequence: int) -> None:
+        """Mark a sequence number as received."""
+        self._above.add(sequence)
+        if sequence - self.low >= _REORDERING:
+            low = sequence - _REORDERING + 1
+            passed = {taken for taken in self._above if taken < low}
+            self.gaps += low - self.low - len(passed)
+            self._above -= passed
+            self.low = low
+        while self.low in self._above:
+            self._above.remove(self.low)
+            self.low += 1
+
+    def give_up(self) -> None:
+        """Give up all numbers below the highest received one."""
+        end = max(self._above, default=self.low - 1) + 1
+        self.gaps += end - self.low - len(self._above)
+        self.low = end
+        self._above.clear()
+
+
+_MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
+_MAX_FAULTS = 3  # rollouts that were left out of an update, after which the incarnation is quarantined
+_GOOD_AGAIN = 100  # rollouts in a row that were learned from, after which the faults before no longer count
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Why a rollout was left out of an update: the category that it is counted under, and what it has."""
+
+    cause: str
+    what: str
+    hint: str = ": examine its environment"
+
+
+NON_FINITE = Fault("non_finite", "no finite gradient", ": its observations or rewards are too large")
+
+
+@dataclass(slots=True)
+class Actor:
+    """State of one actor; the counts are over all its incarnations."""
+
+    name: str
+    epsilon: float = 0.0  # final one, with which it explores
+    forgotten_before: int = 0  # a number that is different after an actor of this name was forgotten
+    incarnation: int = -1  # the newest; -1 before the first Join
+    incarnations: int = 0  # number of incarnations that joined
+    origin: Origin = UNKNOWN  # of the newest incarnation
+    environments: int = 0  # 0 before the actor has joined with its spaces
+    joined: float = 0.0  # when the newest incarnation joined
+    last_seen: float = 0.0
+    left: bool = False  # whether the newest incarnation was present and is no longer
+    sequences: SequenceWindow = field(default_factory=SequenceWindow)  # of the newest incarnation
+    uploads: int = 0  # rollouts or gradients of the newest incarnation that were received, whatever their verdict
+    rows: int = 0  # env_steps that its accepted ones state
+    episode_rows: int = 0  # env_steps of the episodes that they report
+    accepted: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+    busy: int = 0  # number of `busy` answers
+    missed_earlier: int = 0  # rollouts of earlier incarnations that never arrived
+    consecutive_unfit: int = 0  # rollouts that violate the specification
+    faults: int = 0  # rollouts that were left out of an update
+    good_in_a_row: int = 0  # rollouts that were learned from since
+    quarantined: str = ""  # the reason, if the newest incarnation is quarantined
+    drained: bool = False  # whether an operator asked the newest incarnation to leave
+    env_steps: int = 0
+    env_steps_per_second: float = 0.0
+    policy_lag: int = 0  # of the newest rollout
+    fetches: bool = False  # whether the actor requests its snapshots instead of subscribing
+    compact_snapshots: bool = False  # whether it requests compact snapshots
+    received_bytes: int = 0  # rollouts, accepted or not
+    answered_bytes: int = 0  # requested snapshots
+    bytes_up_per_hour: float = 0.0
+    bytes_down_per_hour: float = 0.0
+    client: ClientReport | None = None  # of the newest incarnation, if it is a client that reports
+
+    @property
+    def incarnation_number(self) -> int:
+        """Number that is different for each incarnation of this name."""
+        return self.incarnations + (self.forgotten_before << 32)
+
+    @property
+    def missed(self) -> int:
+        """Number of rollouts that never arrived."""
+        return min(self.missed_earlier + self.sequences.gaps, 2**53)
+
+    def count_unfit(self, violation: str) -> None:
+        """Count a rollout that violates the specification. Quarantine the actor after three in a row.
+
+        Only consecutive rollouts count: an occasional failure of a simulator does not exclude the actor.
+        """
+        self.consecutive_unfit += 1
+        if self.consecutive_unfit >= _MAX_CONSECUTIVE_UNFIT:
+            self.quarantined = bounded_text(f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}")
+
+    def count_trained(self, fault: Fault | None = None) -> None:
+        """Count a rollout that was trained on, or left out for a fault. Quarantine the actor after several faults.
+
+        Unlike a rejected rollout, such a rollout costs the learner much time. Therefore it takes many good ones to make
+        up for it.
+        """
+        if fault is None:
+            self.good_in_a_row += 1
+            if self.good_in_a_row >= _GOOD_AGAIN:
+                self.faults = 0
+            return
+        self.rejected[fault.cause] += 1
+        self.faults, self.good_in_a_row = self.faults + 1, 0
+        if self.faults >= _MAX_FAULTS:
+            self.quarantined = bounded_text(f"{self.faults} of its rollouts had {fault.what}{fault.hint}")
+
+    def start_incarnation(self, incarnation: int, next_sequence: int = 0) -> None:
+        """Set the newest incarnation, without quarantine; its sequence numbers below `next_sequence` were received."""
+        self.sequences.give_up()
+        self.missed_earlier = self.missed
+        self.incarnation, self.sequences = incarnation, SequenceWindow(low=next_sequence)
+        self.incarnations += 1
+        self.uploads, self.rows, self.episode_rows = next_sequence, 0, 0
+        self.consecutive_unfit = self.faults = self.good_in_a_row = 0
+        self.left = False
+        self.quarantined, self.drained = "", False
+        self.fetches = self.compact_snapshots = False
+        self.client = None
+
+
+_MAX_TOKENS = 8192  # tokens: twice the actors that one owner may have
+
+
+class Presence:
+    """Set of present incarnations. The number of one owner is bounded: further ones do not count as present."""
+
+    def __init__(self) -> None:
+        self._present: set[tuple[str, int]] = set()
+        self._of_owner: Counter[str] = Counter()
+
+    def __contains__(self, incarnation: tuple[str, int]) -> bool:
+        return incarnation in self._present
+
+    def set(self, name: str, incarnation: int, present: bool) -> None:
+        """Record whether the token of an incarnation of the actor `name` is present."""
+        key, owner = (name, incarnation), keys.owner(name)
+        if present and key not in self._present and self._of_owner[owner] < _MAX_TOKENS:
+            self._present.add(key)
+            self._of_owner[owner] += 1
+        elif not present and key in self._present:
+            self._present.remove(key)
+            self._of_owner[owner] -= 1
+        if not self._of_owner[owner]:
+            del self._of_owner[owner]
+
+
+_MAX_FORMER = 65_536  # 20 MB; 50 MB if all were quarantined
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Former:
+    """One incarnation of an actor that was forgotten or replaced."""
+
+    next_sequence: int = 0  # all numbers below were received or given up
+    replaced: bool = False  # whether another incarnation joined under the name: this one cannot join again
+    quarantined: str = ""  # the reason, if it was quarantined
+
+
+_UNKNOWN = Former()
+
+
+class FormerIncarnations:
+    """Record of former incarnations, so that none of their rollouts is accepted a second time.
+
+    An incarnation that was replaced never becomes current again, and one that was forgotten continues above the highest
+    sequence number that was received from it. The record is bounded: the oldest entry makes room for the newest. What
+    protects from a second use of its rollouts is then the bound on the policy lag alone.
+    """
+
+    def __init__(self) -> None:
+        self._former: dict[tuple[str, int], Former] = {}  # by name and incarnation, the newest entry last
+
+    def __getitem__(self, key: tuple[str, int]) -> Former:
+        return self._former.get(key, _UNKNOWN)
+
+    def __len__(self) -> int:
+        return len(self._former)
+
+    def add(self, name: str, incarnation: int, former: Former) -> None:
+        """Remember an incarnation of the actor `name`."""
+        self._former.pop((name, incarnation), None)
+        while len(self._former) >= _MAX_FORMER:
+            del self._former[next(iter(self._former))]
+        self._former[name, incarnation] = former
+
+
+_MAX_ENTRIES = 32
+_FORGET_REFUSAL_SECONDS = 3600.0  # after the last refusal
+
+
+@dataclass(slots=True)
+class _Entry:
+    actor: str
+    origin: Origin
+    reason: str
+    count: int = 0
+    last_at: float = 0.0
+
+
+class RefusedJoins:
+    """Bounded table of refusals: one entry for each host and reason, so that restarts of an actor add no entries."""
+
+    def __init__(self) -> None:
+        self._entries: dict[tuple[str, str], _Entry] = {}  # by host (or actor) and reason, the newest last
+
+    def add(self, actor: str, origin: Origin, reason: str, now: float) -> None:
+        """Count a refusal.
+
+        Args:
+          actor: name of the actor.
+          origin: where the actor runs; empty texts if that is not known.
+          reason: why it was refused, or why it failed.
+          now: time on the monotonic clock, in seconds.
+        """
+        self._forget_old(now)
+        actor, origin, reason = bounded_text(actor, MAX_NAME), bounded(origin), bounded_text(reason)
+        key = (origin.host or actor, reason)
+        entry = self._entries.pop(key, None)
+        if entry is None:
+            self._make_room()
+            entry = _Entry(actor, origin, reason)
+        entry.actor, entry.origin = actor, origin
+        entry.count, entry.last_at = entry.count + 1, now
+        self._entries[key] = entry
+
+    def joined(self, actor: str) -> None:
+        """Remove the entries of an actor that has joined since."""
+        for key in [key for key, entry in self._entries.items() if entry.actor == actor]:
+            del self._entries[key]
+
+    def report(self, now: float) -> tuple[RefusedJoin, ...]:
+        """Return the entries, the newest last. `now` is on the monotonic clock, in seconds."""
+        self._forget_old(now)
+        return tuple(
+            RefusedJoin(
+                actor=entry.actor,
+                host=entry.origin.host,
+                software=entry.origin.software,
+                reason=entry.reason,
+                count=entry.count,
+                seconds_since_last=max(now - entry.last_at, 0.0),
+            )
+            for entry in self._entries.values()
+        )
+
+    def _forget_old(self, now: float) -> None:
+        for key in [key for key, entry in self._entries.items() if now - entry.last_at > _FORGET_REFUSAL_SECONDS]:
+            del self._entries[key]
+
+    def _make_room(self) -> None:
+        """Remove the oldest entry of the owner that has the most: no owner can push out the others."""
+        if len(self._entries) >= _MAX_ENTRIES:
+            name = keys.first_of_largest_owner(entry.actor for entry in self._entries.values())
+            del self._entries[next(key for key, entry in self._entries.items() if entry.actor == name)]
+
+
+def bounded(origin: Origin) -> Origin:
+    """Return an origin whose texts are bounded."""
+    return Origin(
+        host=bounded_text(origin.host, MAX_NAME),
+        software=bounded_text(origin.software, MAX_NAME),
+        address=bounded_text(origin.address, MAX_NAME),
+    )
+
 
 __all__ = ["Actor", "Fleet"]
 

@@ -3,18 +3,227 @@
 State that several of the transport's threads read. It decides and encodes the answers; the caller sends them.
 """
 
+import heapq
 import logging
 import math
 import threading
+import time
+from collections.abc import Callable
+from typing import TypedDict, TypeVar
 
+from daedalus.learner.reporting.metrics_rows import MetricsHistory
 from daedalus.learner.serving.events import EventLog
-from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.requests import read_request
+from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
-from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS
-from daedalus.protocol.messages import Acknowledgement, ClientReport, EventKind, Join, Origin, Program, Refusal, Welcome
+from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS, STATUS_REQUEST_LIMITS, Limits
+from daedalus.protocol.messages import (
+    PAGE_ACTORS,
+    Acknowledgement,
+    ActorsPage,
+    ActorsReport,
+    ActorsRequest,
+    ActorStatus,
+    ClientReport,
+    EventKind,
+    EventsPage,
+    EventsReport,
+    EventsRequest,
+    Join,
+    Message,
+    MetricsRequest,
+    Order,
+    Origin,
+    Program,
+    Refusal,
+    RunStatus,
+    StatusReport,
+    Welcome,
+)
 from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.texts import MAX_NAME, bounded_text
+from daedalus.transport.interface import Request
+
+Kind = TypeVar("Kind")
+
+
+def read_request(payload: bytes, limits: Limits, *kinds: type[Kind]) -> Kind | Refusal:
+    """Return the message of a query, or the Refusal of what is no message of these kinds."""
+    try:
+        message = decode(payload, limits)
+    except ProtocolError as error:
+        return Refusal(code="malformed", reason=str(error))
+    if not isinstance(message, kinds):
+        expected = " or ".join(kind.__name__ for kind in kinds)
+        return Refusal(code="malformed", reason=f"expected {expected}, and not {type(message).__name__}")
+    return message
+
+
+class FleetTotals(TypedDict):
+    """Fields of RunStatus that are over all actors. The counts include forgotten actors."""
+
+    actors_alive: int
+    actors_quarantined: int
+    actors_gone: int
+    rollouts_missed: int
+    busy_answers: int
+
+
+def totals(fleet: Fleet) -> FleetTotals:
+    """Return the totals over all actors."""
+    actors = fleet.actors.values()
+    present = [actor for actor in actors if fleet.is_present(actor)]
+    quarantined = sum(bool(actor.quarantined) for actor in present)
+    return {
+        "actors_alive": len(present) - quarantined,
+        "actors_quarantined": quarantined,
+        "actors_gone": len(actors) - len(present),
+        "rollouts_missed": min(fleet.forgotten_missed + sum(actor.missed for actor in actors), 2**53),
+        "busy_answers": fleet.forgotten_busy + sum(actor.busy for actor in actors),
+    }
+
+
+def page(fleet: Fleet, after: str, now: float) -> tuple[ActorStatus, ...]:
+    """Return the status of the actors with the first names after `after`, sorted by name.
+
+    `now` is on the monotonic clock, in seconds.
+    """
+    names = heapq.nsmallest(PAGE_ACTORS, (name for name in fleet.actors if name > after))
+    return tuple(_actor_status(fleet, fleet.actors[name], now) for name in names)
+
+
+def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
+    client = actor.client or ClientReport(actor=actor.name, incarnation=actor.incarnation)
+    return ActorStatus(
+        actor=actor.name,
+        host=actor.origin.host,
+        software=actor.origin.software,
+        address=actor.origin.address,
+        alive=fleet.is_present(actor),
+        quarantined=actor.quarantined,
+        lives=actor.incarnations,
+        seconds_since_seen=max(now - actor.last_seen, 0.0),
+        environments=actor.environments,
+        epsilon=actor.epsilon,
+        env_steps=actor.env_steps,
+        env_steps_per_second=actor.env_steps_per_second,
+        rollouts_accepted=actor.accepted,
+        rollouts_rejected=dict(actor.rejected),
+        rollouts_missed=actor.missed,
+        busy_answers=actor.busy,
+        policy_lag=actor.policy_lag,
+        compact_snapshots=actor.compact_snapshots,
+        bytes_up_per_hour=actor.bytes_up_per_hour,
+        bytes_down_per_hour=actor.bytes_down_per_hour,
+        deadlines=client.deadlines,
+        missed_deadlines=client.missed_deadlines,
+        overridden_actions=client.overridden_actions,
+        safe_actions=client.safe_actions,
+        rollouts_dropped=client.rollouts_dropped,
+        safe_reason=client.safe_reason,
+    )
+
+
+class StatusResponses:
+    """Answers to the queries for the status of one learner."""
+
+    def __init__(
+        self,
+        run: str,
+        learner_epoch: int,
+        status: Callable[[], RunStatus],
+        fleet: Fleet,
+        lock: threading.Condition,
+        events: EventLog,
+        history: MetricsHistory,
+    ) -> None:
+        """`status` returns the status with the first page of actors; it is called with `lock` held."""
+        self._run, self._epoch, self._status = run, learner_epoch, status
+        self._fleet, self._lock, self._events, self._history = fleet, lock, events, history
+
+    def answer(self, request: Request) -> Message:
+        """Return the status, or what the payload requests."""
+        if not request.size:
+            with self._lock:
+                return StatusReport(status=self._status())
+        message = read_request(request.payload, STATUS_REQUEST_LIMITS, ActorsRequest, EventsRequest, MetricsRequest)
+        match message:
+            case ActorsRequest():
+                with self._lock:
+                    actors = page(self._fleet, message.after, time.monotonic())
+                return ActorsReport(page=ActorsPage(learner_epoch=self._epoch, actors=actors))
+            case EventsRequest():
+                events = self._events.report()
+                return EventsReport(page=EventsPage(run=self._run, learner_epoch=self._epoch, events=events))
+            case MetricsRequest():
+                return self._history.page(self._run, self._epoch, message.first)
+            case Refusal():
+                return message
+
+
+_ANSWER_SECONDS = 3.0  # a gateway waits 5 s for its answer
+_MOST_WAITING = 16  # requests whose answers wait
+_LATER = "not saved yet: the events of the run say when the checkpoint is saved"
+
+
+class Orders:
+    """The orders that were not carried out yet.
+
+    A checkpoint is written beside training. The answer waits until it is saved, for a few seconds at most.
+    """
+
+    def __init__(self, stop: threading.Event) -> None:
+        """`stop` ends the run."""
+        self._stop, self._lock = stop, threading.Lock()
+        self._wanted = False
+        self._waiting: list[Request] = []
+        self.stopped = False  # whether an operator stopped the run
+        self.superseded_by: int | None = None  # epoch of a newer learner of the run, for which this one steps down
+
+    def give(self, order: Order, request: Request) -> None:
+        """Note an order, which is answered now or when it is carried out. Does not block."""
+        if order == "stop":
+            self.stopped = True
+            self._stop.set()
+            request.reply(encode(Acknowledgement(verdict="accepted")))
+            return
+        with self._lock:
+            self._wanted = True
+            waits = len(self._waiting) < _MOST_WAITING
+            if waits:
+                self._waiting.append(request)
+        if not waits:
+            _answer_later(request)
+            return
+        timer = threading.Timer(_ANSWER_SECONDS, _answer_later, [request])  # no effect if it is answered by then
+        timer.daemon = True
+        timer.start()
+
+    def step_down(self, newer: int) -> None:
+        """Stop the run here: a learner of it with a newer epoch answers."""
+        self.superseded_by = newer
+        self._stop.set()
+
+    @property
+    def checkpoint_wanted(self) -> bool:
+        """Whether a checkpoint was ordered that `take_checkpoint` has not returned."""
+        return self._wanted
+
+    def take_checkpoint(self) -> Callable[[bool, str], None]:
+        """Take the orders of a checkpoint. Return what answers them: with whether it is saved, and what came of it."""
+        with self._lock:
+            self._wanted, waiting, self._waiting = False, self._waiting, []
+
+        def answer(is_saved: bool, result: str) -> None:
+            accepted = Acknowledgement(verdict="accepted", reason=result)
+            message = encode(accepted if is_saved else Refusal(code="failed", reason=result))
+            for request in waiting:
+                request.reply(message)
+
+        return answer
+
+
+def _answer_later(request: Request) -> None:
+    request.reply(encode(Acknowledgement(verdict="accepted", reason=_LATER)))
 
 
 class QueryResponses:

@@ -16,20 +16,17 @@ import logging
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 from types import MappingProxyType
 
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.updates import updates_of
-from daedalus.learner.serving.actor_state import NON_FINITE, Fault
+from daedalus.learner.run.counters import RunCounters, updates_of
 from daedalus.learner.serving.events import EventLog
-from daedalus.learner.serving.fleet import Actor, Fleet
-from daedalus.learner.serving.gradient_checks import Shapes
-from daedalus.learner.serving.held_answers import HeldAnswers
-from daedalus.learner.serving.request_queue import LATE_SECONDS, RequestQueue
+from daedalus.learner.serving.fleet import NON_FINITE, Actor, Fault, Fleet
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge, acknowledgement
+from daedalus.learner.serving.upload_checks import Shapes
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
@@ -37,6 +34,119 @@ from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Upload
 from daedalus.transport.interface import Request
+
+# Senders take a request for lost that waits 30 s, and send it again.
+_OLDEST_SECONDS = 10.0  # while a request has waited longer, others are refused
+LATE_SECONDS = 15.0  # after which a request needs an answer; an accepted rollout may wait for its batch after that
+
+
+class RequestQueue:
+    """First-in, first-out queue of requests. `offer` does not block, `take` does."""
+
+    def __init__(self, max_bytes: int, max_requests: int) -> None:
+        self.max_requests = max_requests
+        self._max_bytes = max_bytes
+        self._bytes = 0
+        self._requests: deque[tuple[float, Request]] = deque()  # with the time of arrival, on the monotonic clock
+        self._is_closed = self._is_woken = False
+        self._changed = threading.Condition()
+
+    def offer(self, request: Request) -> bool:
+        """Queue a request and return True, or return False if a bound would be exceeded, or the oldest waits too long.
+
+        An empty queue accepts a request of any size.
+        """
+        now = time.monotonic()
+        with self._changed:
+            full = len(self._requests) >= self.max_requests or self._bytes + request.size > self._max_bytes
+            if self._requests and (full or now - self._requests[0][0] > _OLDEST_SECONDS):
+                return False
+            self._bytes += request.size
+            self._requests.append((now, request))
+            self._changed.notify()
+        return True
+
+    def take(self, timeout: float | None = None) -> tuple[float, Request] | None:
+        """Wait for the oldest request; return when it arrived, and it, or None if the queue is closed and empty.
+
+        Raises queue.Empty if no request comes within `timeout` seconds, or after `wake`.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._requests or self._is_closed or self._is_woken, timeout)
+            if self._is_woken or not (self._requests or self._is_closed):
+                self._is_woken = False
+                raise queue.Empty
+            if not self._requests:
+                return None
+            arrived, request = self._requests.popleft()
+            self._bytes -= request.size
+            return arrived, request
+
+    def take_late(self) -> list[Request]:
+        """Take the requests that have waited so long that they need an answer now."""
+        late, now = [], time.monotonic()
+        with self._changed:
+            while self._requests and now - self._requests[0][0] > LATE_SECONDS:
+                _, request = self._requests.popleft()
+                self._bytes -= request.size
+                late.append(request)
+        return late
+
+    def wake(self) -> None:
+        """Let `take` raise queue.Empty once."""
+        with self._changed:
+            self._is_woken = True
+            self._changed.notify()
+
+    @property
+    def bytes(self) -> int:
+        """Total size of the waiting requests, in bytes."""
+        return self._bytes
+
+    def close(self) -> None:
+        """Close the queue: `take` returns the waiting requests, then None."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify()
+
+
+_MOST_SECONDS = 10.0  # an answer waits no longer: its sender would take the rollout for lost
+
+
+class HeldAnswers:
+    """The requests whose answers wait. The caller guards it with a lock, and answers without the lock."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None  # when the learner began to compute; None: it does not
+        self._waiting: list[Request] = []
+        self._released: list[Request] = []
+
+    @property
+    def holds(self) -> bool:
+        """Whether answers wait now."""
+        return self._since is not None
+
+    def begin(self, now: float) -> None:
+        """Hold answers from now on: the learner computes. `now` is on the monotonic clock, in seconds."""
+        self._since = now
+
+    def release(self) -> None:
+        """Hold answers no more. Those that wait may be taken, also if the next batch begins before they are."""
+        self._since = None
+        self._released += self._waiting
+        self._waiting = []
+
+    def add(self, request: Request) -> None:
+        """Add a request. The caller has checked `holds`."""
+        self._waiting.append(request)
+
+    def take(self, now: float) -> list[Request]:
+        """Return the requests to answer now: those that were released, and all if they have waited too long."""
+        if self._since is not None and now > self._since + _MOST_SECONDS:
+            self.release()
+        released, self._released = self._released, []
+        return released
+
 
 POLL_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
 # Largest batch of a synchronous run in memory, whichever is larger: bytes, or the rollouts of so many fleets as large

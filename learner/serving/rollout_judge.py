@@ -10,9 +10,14 @@ from typing import Literal
 
 import numpy as np
 
-from daedalus.learner.serving.components import first_component_violation
 from daedalus.learner.serving.fleet import Actor, Fleet
-from daedalus.learner.serving.gradient_checks import Shapes, gradient_limits, gradient_violation, restored
+from daedalus.learner.serving.upload_checks import (
+    Shapes,
+    first_component_violation,
+    gradient_limits,
+    gradient_violation,
+    restored,
+)
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement

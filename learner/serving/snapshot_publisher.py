@@ -1,23 +1,190 @@
 """Publication of the program and of snapshots, by push, by query, and as compact snapshots."""
 
 import contextlib
+import queue
 import threading
+import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.compact_snapshot_server import CompactSnapshotServer
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.query_responses import QueryResponses
-from daedalus.learner.serving.requests import read_request
+from daedalus.learner.serving.query_responses import QueryResponses, read_request
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
-from daedalus.protocol.codec import encode
-from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS
-from daedalus.protocol.messages import Program, Refusal, Snapshot, SnapshotRequest
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.compact import Bits, bfloat16, planes
+from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS, Limits
+from daedalus.protocol.messages import CompactSnapshot, Program, Refusal, Snapshot, SnapshotPart, SnapshotRequest
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request, Transport, TransportError
+
+# A part waits in the router until the reader's link is free. A part larger than the router's buffer for one reader
+# would block the learner's messages to all other readers.
+PART_BYTES = 32 << 10
+_HELD_BYTES = 64 << 20  # of versions that can be the base of a difference
+# Encoded snapshots are kept for the fetches in progress.
+_PREPARED_BYTES = 256 << 20
+_MAX_PREPARED = 1024  # held versions that actors name: those that are not held here share one whole snapshot
+_FORGET_SECONDS = 120.0  # after the last request; an actor that still fetches asks within 60 s
+_LARGE_DIFFERENCE = 1.3  # bytes per weight; above it, the whole snapshot may be smaller than the difference
+
+
+@dataclass(slots=True)
+class _Prepared:
+    """Encoded CompactSnapshot, before it is split into parts."""
+
+    base: int | None  # the version that the differences refer to; None: no differences
+    encoded: bytes
+    requested_at: float  # on the monotonic clock, in seconds
+
+
+class CompactSnapshotCache:
+    """Cache of compact snapshots during one learner epoch. Answers SnapshotRequests."""
+
+    def __init__(self, learner_epoch: int) -> None:
+        self._epoch = learner_epoch
+        self._held: dict[int, Bits] = {}  # by version, the most recently requested version last
+        # By the version of the snapshot and the held version that was requested; the most recent request last.
+        self._prepared: dict[tuple[int, int | None], _Prepared] = {}
+
+    def answer(self, request: SnapshotRequest, newest: bytes) -> bytes:
+        """Return the encoded SnapshotPart that `request` names, or a Refusal.
+
+        Args:
+          request: names the part, and the version that the actor holds.
+          newest: the newest encoded Snapshot, or the message that is sent in its place.
+        """
+        version, held = request.policy_version, request.held_version
+        if version is None:
+            snapshot = decode(newest, Limits(max_bytes=len(newest)))
+            if not isinstance(snapshot, Snapshot):
+                return newest
+            version = snapshot.policy_version
+            if (version, held) not in self._prepared:
+                self._prepared[version, held] = self._prepare(snapshot, held)
+                self._make_room()
+        prepared = self._prepared.pop((version, held), None)
+        if prepared is None:
+            return encode(Refusal(code="unknown", reason="the snapshot is no longer available: request the newest"))
+        self._prepared[version, held] = prepared
+        prepared.requested_at = time.monotonic()
+        parts = -(-len(prepared.encoded) // PART_BYTES)
+        if request.part >= parts:
+            return encode(
+                Refusal(code="unknown", reason=f"part {request.part} does not exist: the snapshot has {parts} parts")
+            )
+        piece = prepared.encoded[request.part * PART_BYTES : (request.part + 1) * PART_BYTES]
+        return encode(
+            SnapshotPart(
+                learner_epoch=self._epoch,
+                policy_version=version,
+                part=request.part,
+                parts=parts,
+                data=np.frombuffer(piece, np.uint8),
+            )
+        )
+
+    def _prepare(self, snapshot: Snapshot, held: int | None) -> _Prepared:
+        """Return the encoded snapshot: the whole one if `held` is no version to which a difference can be computed."""
+        version = snapshot.policy_version
+        base = self._held.get(held) if held is not None else None
+        held = None if base is None else held
+        for (prepared_version, _), prepared in self._prepared.items():
+            if (prepared_version, prepared.base) == (version, held):
+                return replace(prepared)  # of the same bytes
+        bits = self._held.pop(version, None) or bfloat16(snapshot.weights)
+        encoded = _encoded(snapshot, bits, held, base)
+        count = sum(array.size for array in bits.values())
+        if base is not None and len(encoded) > _LARGE_DIFFERENCE * count:
+            whole = _encoded(snapshot, bits, None, None)
+            if len(whole) < len(encoded):
+                encoded = whole
+        self._hold(version, bits)
+        return _Prepared(held, encoded, time.monotonic())
+
+    def _make_room(self) -> None:
+        """Drop the encoded snapshots that were not requested for longest, but never the newest."""
+        now = time.monotonic()
+        while len(self._prepared) > 1:
+            key, oldest = next(iter(self._prepared.items()))
+            is_current = now - oldest.requested_at <= _FORGET_SECONDS
+            if is_current and len(self._prepared) <= _MAX_PREPARED and self._prepared_bytes <= _PREPARED_BYTES:
+                break
+            del self._prepared[key]
+
+    @property
+    def _prepared_bytes(self) -> int:
+        """Size of the encoded snapshots; those that several held versions share count once."""
+        return sum({id(each.encoded): len(each.encoded) for each in self._prepared.values()}.values())
+
+    def _hold(self, version: int, bits: Bits) -> None:
+        """Keep a version as the base of later differences. At capacity, drop the least recently requested version."""
+        self._held[version] = bits
+        each = sum(array.nbytes for array in bits.values())
+        while len(self._held) > max(_HELD_BYTES // max(each, 1), 2):
+            del self._held[next(iter(self._held))]
+
+
+def _encoded(snapshot: Snapshot, bits: Bits, held: int | None, base: Bits | None) -> bytes:
+    return encode(
+        CompactSnapshot(
+            learner_epoch=snapshot.learner_epoch,
+            policy_version=snapshot.policy_version,
+            program=snapshot.program,
+            base_version=held,
+            weights=planes(bits, base),
+        )
+    )
+
+
+_MAX_WAITING = 4096  # requests, of at most a kilobyte each
+_CLOSE_SECONDS = 0.5  # for an answer in progress; a frozen reader must not delay the shutdown further
+
+
+class CompactSnapshotServer:
+    """Server of SnapshotRequests for compact snapshots, from `open` to `close`."""
+
+    def __init__(
+        self, learner_epoch: int, newest: Callable[[], bytes], on_answer: Callable[[SnapshotRequest, int], None]
+    ) -> None:
+        """Construct the server.
+
+        Args:
+          learner_epoch: epoch of this learner process.
+          newest: function that returns the newest encoded snapshot.
+          on_answer: called with the request and the number of bytes after each answer.
+        """
+        self._cache = CompactSnapshotCache(learner_epoch)
+        self._newest, self._on_answer = newest, on_answer
+        self._requests: queue.SimpleQueue[tuple[Request, SnapshotRequest] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="compact snapshots", daemon=True)
+
+    def open(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def offer(self, request: Request, message: SnapshotRequest) -> None:
+        """Queue a request and its decoded payload, or refuse it if the queue is full. Does not block."""
+        if self._requests.qsize() >= _MAX_WAITING:
+            request.reply(encode(Refusal(code="not_ready", reason="too many requests for snapshots: retry later")))
+        else:
+            self._requests.put((request, message))
+
+    def close(self) -> None:
+        """Answer the waiting requests, and stop the thread."""
+        self._requests.put(None)
+        if self._thread.is_alive():
+            self._thread.join(timeout=_CLOSE_SECONDS)
+
+    def _work(self) -> None:
+        while (waiting := self._requests.get()) is not None:
+            request, message = waiting
+            answer = self._cache.answer(message, self._newest())
+            request.reply(answer)
+            self._on_answer(message, len(answer))
 
 
 class SnapshotPublisher:

@@ -15,12 +15,12 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daedalus.learner.run.descriptors import reserved_descriptors
-from daedalus.learner.run.evaluations import Evaluated
 from daedalus.learner.run.health import SLOW_DISK_SECONDS
+from daedalus.learner.run.process_resources import reserved_descriptors
 from daedalus.learner.run.run_directory import CONFIG, write_config
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.serving.evaluations import Evaluated
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpoint import EncodedCheckpoint, encode_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner

@@ -23,9 +23,9 @@ from daedalus.algorithms.normalization import (
     observations_name,
     one,
 )
+from daedalus.learner.run.counters import updates_of
+from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.run.updates import updates_of
-from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.gradient_faults import rollouts_at_fault
 from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.received_gradients import (

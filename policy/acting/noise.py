@@ -1,7 +1,6 @@
 """The random numbers that a policy program makes samples from."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +13,7 @@ class NoiseSize(NamedTuple):
     normal: int  # G
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Noise:
+class Noise(NamedTuple):
     """The noise of one row of E environments."""
 
     uniform: np.ndarray  # [E, U] float32, from 0 to 1, 1 excluded
@@ -26,7 +24,9 @@ def draw_noise(size: NoiseSize, rows: int, random: np.random.Generator) -> Noise
     """Return noise for sampled actions."""
     return Noise(
         uniform=random.random((rows, size.uniform), np.float32),
-        normal=random.standard_normal((rows, size.normal), np.float32),
+        normal=random.standard_normal((rows, size.normal), np.float32)
+        if size.normal
+        else np.zeros((rows, 0), np.float32),
     )
 
 

@@ -93,6 +93,7 @@ class ProgramSession:
         watchdog.begin(lambda: options.set_load_cancellation_flag(True))
         try:
             self.onnx = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+            self._outputs = [output.name for output in self.onnx.get_outputs()]
         except Exception as error:  # onnxruntime's exceptions share no base of their own
             raise PolicyError(f"the program cannot be run: {_first_line(error)}") from None
         finally:
@@ -102,7 +103,7 @@ class ProgramSession:
         """Return the program's outputs. Raises PolicyError if it fails or does not end in time."""
         self._watchdog.begin(self._terminate)
         try:
-            return list(self.onnx.run(None, feed, self._run_options))
+            return list(self.onnx.run(self._outputs, feed, self._run_options))
         except Exception as error:  # onnxruntime's exceptions share no base of their own
             late = "it took too long: " if self._run_options.terminate else ""
             raise PolicyError(f"the program failed: {late}{_first_line(error)}") from None

@@ -6,11 +6,8 @@ from torch import Tensor, nn
 from daedalus.policy.network.distributions import (
     Categorical,
     Distribution,
-    Gaussian,
-    GaussianMixture,
     Greedy,
-    Kumaraswamy,
-    SquashedGaussian,
+    continuous_distribution,
     without_illegal,
 )
 from daedalus.policy.network.layers import Components, find_class
@@ -110,20 +107,13 @@ def _distribution(
         return Categorical(space)
     if ":" in spec.distribution:
         return _custom(spec.distribution, name, space, modules)
-    if not space.bounded and spec.distribution in ("squashed_gaussian", "kumaraswamy"):
+    try:
+        return continuous_distribution(spec, space)
+    except ValueError as error:
         raise NetworkError(
-            f"policy.distribution={spec.distribution} needs bounded actions, but {name!r} is {space}: "
+            f"policy.distribution={spec.distribution} {error}, but {name!r} is {space}: "
             "set policy.distribution to gaussian"
-        )
-    match spec.distribution:
-        case "squashed_gaussian":
-            return SquashedGaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
-        case "gaussian_mixture":
-            return GaussianMixture(space, initial_std=spec.initial_std, components=spec.mixture_components)
-        case "kumaraswamy":
-            return Kumaraswamy(space)
-        case _:
-            return Gaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
+        ) from None
 
 
 def _custom(reference: str, name: str, space: ContinuousSpace, modules: UserModules) -> Distribution:

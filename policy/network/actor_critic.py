@@ -9,8 +9,8 @@ from daedalus.policy.network.action_distribution import ActionDistribution
 from daedalus.policy.network.encoders import build_encoder
 from daedalus.policy.network.exploration import Exploration
 from daedalus.policy.network.layers import Components, orthogonal
-from daedalus.policy.network.memory import Gru, NoMemory
-from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.network.observation_normalizer import ObservationNormalizer
+from daedalus.policy.network.recurrent_memory import Gru, NoMemory
 from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces

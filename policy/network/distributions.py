@@ -10,6 +10,7 @@ from torch.nn.functional import softplus
 
 from daedalus.policy.network.layers import variables_and_values
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace
+from daedalus.protocol.spec import PolicySpec
 
 
 class Distribution(nn.Module):
@@ -96,6 +97,7 @@ class _Bounded(torch.autograd.Function):
 
 
 _SMALLEST = 1e-30  # of uniform noise: at 0 a legal choice would be less probable than one that is not
+_FEW_CHOICES = 16  # on a CPU, torch's softmax and sums of so many take half the time over the first axis
 _ABSENT = -1e30  # logit of a choice that a variable does not have, or that is not legal: its probability is exactly 0
 
 
@@ -127,8 +129,11 @@ class Categorical(Distribution):
 
     def log_prob_and_entropy(self, parameters: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """See Distribution."""
-        log_probs = self._log_probs(parameters)
-        return _chosen(log_probs, actions), _categorical_entropy(log_probs)
+        arranged, axis = self._by_variable(parameters), -1
+        if arranged.shape[-1] <= _FEW_CHOICES:
+            arranged, axis = arranged.movedim(-1, 0), 0
+        log_probs = arranged.log_softmax(axis)
+        return _chosen(log_probs, actions, axis), _categorical_entropy(log_probs, axis)
 
     def _log_probs(self, parameters: Tensor) -> Tensor:
         return self._by_variable(parameters).log_softmax(-1)  # [..., D, A]
@@ -147,12 +152,12 @@ def without_illegal(logits: Tensor, mask: Tensor) -> Tensor:
     return logits.masked_fill(~mask, _ABSENT)
 
 
-def _chosen(log_probs: Tensor, actions: Tensor) -> Tensor:
-    return log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(-1)
+def _chosen(log_probs: Tensor, actions: Tensor, axis: int = -1) -> Tensor:
+    return log_probs.gather(axis, actions.unsqueeze(axis)).squeeze(axis).sum(-1)
 
 
-def _categorical_entropy(log_probs: Tensor) -> Tensor:
-    return -(log_probs.exp() * log_probs).sum(-1).sum(-1)
+def _categorical_entropy(log_probs: Tensor, axis: int = -1) -> Tensor:
+    return -(log_probs.exp() * log_probs).sum(axis).sum(-1)
 
 
 def _padded(counts: tuple[int, ...]) -> tuple[Tensor, Tensor]:
@@ -437,3 +442,18 @@ class Uniform(Distribution):
         """See Distribution: -1e30 for actions that are never chosen."""
         outside = (actions.abs() > _LARGEST_UNIFORM).any(-1)
         return torch.where(outside, _NEVER, self._log_density)
+
+
+def continuous_distribution(spec: PolicySpec, space: ContinuousSpace) -> Distribution:
+    """Return the built-in distribution `spec.distribution`. Raises ValueError if it needs bounds that `space` lacks."""
+    match spec.distribution:
+        case "squashed_gaussian" | "kumaraswamy" if not space.bounded:
+            raise ValueError("needs bounded actions")
+        case "squashed_gaussian":
+            return SquashedGaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
+        case "gaussian_mixture":
+            return GaussianMixture(space, initial_std=spec.initial_std, components=spec.mixture_components)
+        case "kumaraswamy":
+            return Kumaraswamy(space)
+        case _:
+            return Gaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)

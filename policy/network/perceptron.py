@@ -57,12 +57,13 @@ class _Layers(torch.autograd.Function):
     def forward(ctx: Any, inputs: Tensor, is_tanh: bool, *parameters: Tensor) -> Tensor:
         """Compute the features of inputs [N, inputs] float32, or [N, K] int64 as for Perceptron.of_choices."""
         outputs = [inputs]
+        factor = 2 if is_tanh else 1
         for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
             if outputs[-1].dtype == torch.int64:
-                output = torch.embedding(weight.t(), inputs).sum(1).add_(bias)
+                output = torch.embedding(weight.t(), inputs).sum(1).add_(bias).mul_(factor)
             else:
-                output = torch.addmm(bias, outputs[-1], weight.t())
-            outputs.append(_tanh(output) if is_tanh else output.relu_())
+                output = torch.addmm(bias, outputs[-1], weight.t(), beta=factor, alpha=factor)
+            outputs.append(_tanh_of_half(output) if is_tanh else output.relu_())
         ctx.is_tanh = is_tanh
         ctx.save_for_backward(*outputs, *parameters[::2])
         return outputs[-1]
@@ -88,13 +89,14 @@ class _Layers(torch.autograd.Function):
 def _weight_gradient(inner: Tensor, inputs: Tensor, width: int) -> Tensor:
     """Return the gradient of the weights of a layer [units, width], from that of its outputs [N, units]."""
     if inputs.dtype != torch.int64:
-        return inner.t() @ inputs
+        # Few columns on the right take several times longer than few rows on the left.
+        return inner.t() @ inputs if width >= inner.shape[1] else (inputs.t() @ inner).t()
     columns = inputs.shape[1]
     each = inner if columns == 1 else inner.repeat_interleave(columns, 0)
     return torch.ops.aten.embedding_dense_backward(each, inputs.flatten(), width, -1, False).t()
 
 
-def _tanh(values: Tensor) -> Tensor:
-    """Replace values by their tanh, which is 2 sigmoid(2x) - 1."""
-    half = values.add_(values).sigmoid_()  # sums, because a multiplication by a number takes longer
-    return half.add_(half).sub_(1.0)
+def _tanh_of_half(values: Tensor) -> Tensor:
+    """Replace values 2x by tanh(x), which is 2 sigmoid(2x) - 1."""
+    half = values.sigmoid_()
+    return half.add_(half).sub_(1.0)  # a sum, because a multiplication by a number takes longer

@@ -3,6 +3,7 @@
 import itertools
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import gymnasium
@@ -45,15 +46,14 @@ def _original(seed: int, actions: list[int], limit: int) -> list[tuple]:
 
 
 def _ours(backend: str, seed: int, actions: list[int], limit: int) -> list[tuple]:
-    environments = PlainEnvironments(make_environments(_spec(backend=backend, max_episode_steps=limit), 1))
-    try:
+    with closing(
+        PlainEnvironments(make_environments(_spec(backend=backend, max_episode_steps=limit), 1))
+    ) as environments:
         rows = [(environments.reset(seed)[0], 0.0, False, False)]
         for action in actions:
             frames, rewards, terminated, truncated = environments.step(np.array([action]))
             rows.append((frames[0].copy(), float(rewards[0]), bool(terminated[0]), bool(truncated[0])))
         return rows
-    finally:
-        environments.close()
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from processes import LIMIT
 
 from daedalus.actor.session import compact_snapshot_fetcher
 from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
-from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
+from daedalus.learner.serving.snapshot_publisher import CompactSnapshotCache
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import bfloat16, float32

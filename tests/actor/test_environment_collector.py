@@ -18,7 +18,7 @@ from plain import PlainPolicy, plain, vector_spaces
 from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import Observed, Step
+from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import USER_STATE, UserModules
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec
@@ -76,7 +76,8 @@ def rows(rollouts: list[Rollout], name: str) -> np.ndarray:
     return np.concatenate([getattr(rollout, name)[:, 0] for rollout in rollouts])
 
 
-def test_each_row_holds_its_observation_action_and_reward(collected: tuple[list[Rollout], Scripted]) -> None:
+def test_each_row_holds_its_observation_action_reward_and_flags(collected: tuple[list[Rollout], Scripted]) -> None:
+    """Row 2 ends episode 0; row 3 still shows its last observation, which the value of row 2's successor needs."""
     rollouts, policy = collected
     observations = np.concatenate([plain(rollout.frames)[:-1, 0] for rollout in rollouts])
     np.testing.assert_array_equal(observations, np.stack([EPISODE, STEP], axis=1))
@@ -84,24 +85,8 @@ def test_each_row_holds_its_observation_action_and_reward(collected: tuple[list[
     np.testing.assert_array_equal(np.concatenate([plain(rollout.actions)[:, 0, 0] for rollout in rollouts]), ACTION)
     np.testing.assert_allclose(rows(rollouts, "rewards"), REWARD, rtol=1e-6)
     np.testing.assert_allclose(rows(rollouts, "behaviour_log_probs"), -0.5 * np.arange(1, 13))
-
-
-def test_rows_distinguish_termination_truncation_and_resets(collected: tuple[list[Rollout], Scripted]) -> None:
-    rollouts, _ = collected
-    np.testing.assert_array_equal(rows(rollouts, "terminated"), TERMINATED)
-    np.testing.assert_array_equal(rows(rollouts, "truncated"), TRUNCATED)
-    np.testing.assert_array_equal(rows(rollouts, "valid"), VALID)
-
-
-def test_reset_row_holds_the_true_last_observation_of_the_episode(collected: tuple[list[Rollout], Scripted]) -> None:
-    rollouts, _ = collected
-    # Row 2 ends episode 0; row 3 still shows its observation 3, which the value of row 2's successor needs.
-    np.testing.assert_array_equal(plain(rollouts[0].frames)[3, 0], [0, 3])
-    np.testing.assert_array_equal(plain(rollouts[1].frames)[2, 0], [1, 2])
-
-
-def test_last_observation_of_a_rollout_is_the_first_of_the_next(collected: tuple[list[Rollout], Scripted]) -> None:
-    rollouts, _ = collected
+    for name, expected in (("terminated", TERMINATED), ("truncated", TRUNCATED), ("valid", VALID)):
+        np.testing.assert_array_equal(rows(rollouts, name), expected)
     for before, after in itertools.pairwise(rollouts):
         np.testing.assert_array_equal(plain(before.frames)[-1], plain(after.frames)[0])
 
@@ -217,17 +202,14 @@ def test_negative_rewards_are_clipped_like_positive_ones() -> None:
 REMEMBERED = np.array([[0, 0], [1, 0], [2, 1], [3, 3], [0, 0], [1, 0], [2, 1], [0, 0], [1, 0], [0, 0], [1, 0], [2, 1]])
 
 
-def test_memory_covers_the_running_episode_only(collected: tuple[list[Rollout], Scripted]) -> None:
-    _, policy = collected
+def test_memory_covers_the_running_episode_only_and_a_rollout_holds_that_before_its_first_row(
+    collected: tuple[list[Rollout], Scripted],
+) -> None:
+    rollouts, policy = collected
     np.testing.assert_array_equal(np.concatenate(policy.remembered), REMEMBERED)
-
-
-def test_rollout_holds_the_memory_before_its_first_row(collected: tuple[list[Rollout], Scripted]) -> None:
-    rollouts, _ = collected
-    np.testing.assert_array_equal(
-        np.concatenate([rollout.initial_state for rollout in rollouts]), REMEMBERED[[0, 4, 8]]
-    )
-    assert rollouts[2].initial_state.any()  # it begins in the middle of an episode
+    begins = np.concatenate([rollout.initial_state for rollout in rollouts])
+    np.testing.assert_array_equal(begins, REMEMBERED[[0, 4, 8]])
+    assert begins[2].any()  # it begins in the middle of an episode
 
 
 def test_each_environment_has_its_own_memory() -> None:
@@ -329,12 +311,9 @@ def drawn(seed: int) -> tuple[list[float], list[float]]:
     return np.random.default_rng(both.seed).random(2, np.float32).tolist(), both.noise.uniform[0].tolist()
 
 
-def test_environments_and_actions_draw_from_different_random_numbers() -> None:
+def test_environments_and_actions_draw_from_different_random_numbers_which_a_seed_determines() -> None:
     """With one seed for both, the numbers that choose the actions would be those of the environment."""
     assert len({tuple(numbers) for seed in (1, 2) for numbers in drawn(seed)}) == 4
-
-
-def test_the_same_seed_gives_the_same_random_numbers() -> None:
     assert drawn(1) == drawn(1)
 
 

@@ -12,9 +12,9 @@ from allowed_modules import TEST_MODULES
 from plain import PlainEnvironments, choices
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import BackendEnvironments
 from daedalus.actor.environments.make import make_bare, make_environments
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.environments.vector_environments import BackendEnvironments
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec

@@ -1,5 +1,6 @@
 """One seed for each evaluated episode: the results do not depend on how many environments play at once."""
 
+from contextlib import closing
 from typing import Any
 
 import gymnasium
@@ -10,8 +11,8 @@ from allowed_modules import TEST_MODULES
 from counting_environment import Counting
 from plain import PlainPolicy
 
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.actor.evaluation.episodes import Evaluation, play_episodes
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.program import export_program
@@ -38,11 +39,8 @@ def runtime(spaces: Spaces, **policy: Any) -> OnnxRuntime:
 def played(
     spec: EnvironmentSpec, count: int, *, sampled: bool = True, episodes: int = EPISODES, seed: int = 1, **policy: Any
 ) -> Evaluation:
-    environments = make_environments(spec, count, modules=TEST_MODULES, one_episode=True)
-    try:
+    with closing(make_environments(spec, count, modules=TEST_MODULES, one_episode=True)) as environments:
         return play_episodes(runtime(environments.spaces, **policy), environments, episodes, seed, sampled=sampled)
-    finally:
-        environments.close()
 
 
 def assert_same(evaluations: list[Evaluation], differing: int) -> None:

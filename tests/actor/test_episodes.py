@@ -11,8 +11,8 @@ from counting_environment import Counting
 from plain import PlainPolicy
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import UserModules

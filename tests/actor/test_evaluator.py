@@ -11,7 +11,7 @@ from plain import NAME
 from processes import LIMIT
 from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_spec
 
-from daedalus.actor.environments.interface import Observed, Step
+from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.origin import own_origin
 from daedalus.protocol.messages import Join, Refusal

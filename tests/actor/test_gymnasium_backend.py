@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from ctypes.util import find_library
 from functools import partial
 from pathlib import Path
@@ -62,8 +63,7 @@ def _rows(environments: PlainEnvironments, actions: list[int]) -> list[tuple]:
 @pytest.mark.parametrize("processes", [False, True])
 def test_repeats_sum_rewards_and_stop_at_the_end_of_an_episode(processes: bool) -> None:
     """Counting's episodes have 3 steps (terminated), 2 (truncated) and 1 (terminated), and rewards identify them."""
-    environments = make_environments(_counting(action_repeat=2, processes=processes), 2)
-    try:
+    with closing(make_environments(_counting(action_repeat=2, processes=processes), 2)) as environments:
         assert environments.reset(1).tolist() == [[0.0, 0.0]] * 2
         assert _rows(environments, [1, 0, 3, 0, 0, 2, 0]) == [
             ([0.0, 2.0], 1.2, False, False),  # 0 + 1, plus a tenth of the action twice
@@ -74,8 +74,6 @@ def test_repeats_sum_rewards_and_stop_at_the_end_of_an_episode(processes: bool) 
             ([2.0, 1.0], 20.2, True, False),
             ([3.0, 0.0], 0.0, False, False),
         ]
-    finally:
-        environments.close()
 
 
 class Doubling(gymnasium.Env):
@@ -323,11 +321,8 @@ def test_processes_give_the_same_steps_as_one_process() -> None:
     actions = np.random.default_rng(3).integers(0, 3, (25, 3))
     played = []
     for processes in (False, True):
-        environments = make_environments(spec.model_copy(update={"processes": processes}), 3)
-        try:
+        with closing(make_environments(spec.model_copy(update={"processes": processes}), 3)) as environments:
             steps = [environments.step(row) for row in actions] if environments.reset(11) is not None else []
-        finally:
-            environments.close()
         played.append([np.stack(part) for part in zip(*steps, strict=True)])
     for here, there in zip(*played, strict=True):
         np.testing.assert_array_equal(here, there)
@@ -482,8 +477,7 @@ def test_process_whose_environment_hangs_ends_after_its_parent_was_killed(tmp_pa
 
 
 def test_processes_ignore_interrupts() -> None:
-    environments = _processes()
-    try:
+    with closing(_processes()) as environments:
         environments.reset(seed=1)
         for process in environments.processes:
             assert process.pid is not None
@@ -493,8 +487,6 @@ def test_processes_ignore_interrupts() -> None:
         assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, []), (
             "the parent does not ignore interrupts"
         )
-    finally:
-        environments.close()
 
 
 # ------------------------------------------------------------------------------- observations outside their space
@@ -553,13 +545,10 @@ def test_number_that_the_dtype_of_its_space_cannot_hold_is_refused(
 ) -> None:
     kwargs = {"shown": [0, number, 0], "space": space, "dtype": dtype}
     spec = EnvironmentSpec(id="showing_environments:Showing-v0", kwargs=kwargs, processes=processes)
-    environments = created(spec, 2, modules=UserModules(frozenset({"showing_environments"})))
-    try:
+    with closing(created(spec, 2, modules=UserModules(frozenset({"showing_environments"})))) as environments:
         environments.reset(1)
         with pytest.raises(EnvironmentSetupError, match=f"Showing-v0: step returns an observation .*{reason}"):
             environments.step({"action": np.zeros((2, 1), np.int64)})
-    finally:
-        environments.close()
 
 
 def test_only_one_environment_is_reset_to_learn_whether_there_are_masks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -601,14 +590,11 @@ def test_component_that_is_left_out_does_not_hide_an_error() -> None:
 def _play(processes: bool, steps: int = 12, **settings: Any) -> dict[str, list[float]]:
     """Play two faulty environments, and return the scalars of their infos."""
     spec = EnvironmentSpec(id="faulty_environments:Faulty-v0", processes=processes, **settings)
-    environments = make.make_environments(spec, 2, modules=FAULTY)
-    try:
+    with closing(make.make_environments(spec, 2, modules=FAULTY)) as environments:
         environments.reset(1)
         for _ in range(steps):
             environments.step({"action": np.zeros((2, 1), np.int64)})
         return {name: values.tolist() for name, values in environments.take_episode_info().items()}
-    finally:
-        environments.close()
 
 
 @pytest.mark.parametrize("processes", [False, True])
@@ -693,12 +679,9 @@ def test_minigrid_is_registered_by_its_names() -> None:
 @pytest.mark.parametrize("kwargs", [{}, {"text_space": True}], ids=["space of its own", "text with blanks"])
 def test_text_can_be_left_out_in_processes(kwargs: dict[str, Any]) -> None:
     spec = EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), processes=True, kwargs=kwargs)
-    environments = created(spec, 2)
-    try:
+    with closing(created(spec, 2)) as environments:
         assert environments.reset(1).frames["step"].tolist() == [[0.0], [0.0]]
         assert environments.step({"action": np.array([[0], [1]])})[1].tolist() == [0.0, 1.0]
-    finally:
-        environments.close()
 
 
 def test_atari_games_of_gymnasium_have_their_own_frames() -> None:

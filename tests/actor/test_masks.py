@@ -1,5 +1,6 @@
 """Masks of illegal actions, by each convention that environments have."""
 
+from contextlib import closing
 from typing import Any
 
 import gymnasium
@@ -108,8 +109,7 @@ def _registered() -> Any:
 @pytest.mark.parametrize("convention", ["info", "method", "observation"])
 def test_masks_accompany_their_observations(convention: str) -> None:
     spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention})
-    environments = make_environments(spec, 2)
-    try:
+    with closing(make_environments(spec, 2)) as environments:
         assert environments.spaces.actions == {"action": DiscreteSpace(counts=(3,), masked=True)}
         assert list(environments.spaces.observations) == ["seen" if convention == "observation" else "observation"]
         observed = environments.reset(1)
@@ -118,13 +118,12 @@ def test_masks_accompany_their_observations(convention: str) -> None:
             legal.append(np.flatnonzero(observed.masks["action"][0]).tolist())
             observed, *_ = environments.step({"action": observed.masks["action"].argmax(1)[:, None]})
         assert legal == [[0], [1], [2], [0], [0], [1], [2], [0]]
-    finally:
-        environments.close()
 
 
 def test_map_of_masks_arrives_with_every_step() -> None:
-    environments = make_environments(EnvironmentSpec(id="nested_environment:NestedMasked-v0"), 2, modules=TEST_MODULES)
-    try:
+    with closing(
+        make_environments(EnvironmentSpec(id="nested_environment:NestedMasked-v0"), 2, modules=TEST_MODULES)
+    ) as environments:
         sizes = environments.spaces.masks
         assert sizes
         observed = environments.reset(1)
@@ -134,8 +133,6 @@ def test_map_of_masks_arrives_with_every_step() -> None:
             }
             legal = {name: mask.argmax(1)[:, None] for name, mask in observed.masks.items()}
             observed, *_ = environments.step(first_actions(environments.spaces) | legal)
-    finally:
-        environments.close()
 
 
 def first_actions(spaces: Spaces) -> dict[str, np.ndarray]:
@@ -164,15 +161,12 @@ class LegalPolicy(PlainPolicy):
 def test_rollout_holds_the_mask_of_each_row() -> None:
     """Two episodes, each with the row that only resets, whose mask has no meaning."""
     spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "info"})
-    collector = started_collector(spec, LegalPolicy(), count=2, rollout_length=6)
-    try:
+    with closing(started_collector(spec, LegalPolicy(), count=2, rollout_length=6)) as collector:
         for legal in ([0, 1, 2, 0, 0, 1], [2, 0, 0, 1, 2, 0]):
             masks = collect(collector).masks["action"]
             assert masks.dtype == np.bool_
             for environment in range(2):
                 assert masks[:, environment].tolist() == np.eye(3, dtype=np.bool_)[legal].tolist()
-    finally:
-        collector.close()
 
 
 @pytest.mark.parametrize("convention", ["info", "method", "observation"])
@@ -373,11 +367,8 @@ def test_masks_of_an_environment_may_be_lists(monkeypatch: pytest.MonkeyPatch, m
 @pytest.mark.parametrize("convention", ["info", "method", "observation", "list"])
 def test_environments_that_have_ended_need_no_legal_choice_in_an_evaluation(convention: str) -> None:
     spec = EnvironmentSpec(id="Uneven-v0", kwargs={"convention": convention})
-    environments = make_environments(spec, 8, one_episode=True)
-    try:
+    with closing(make_environments(spec, 8, one_episode=True)) as environments:
         evaluation = play_episodes(LegalPolicy(), environments, 20, seed=1, sampled=False)
-    finally:
-        environments.close()
     assert set(evaluation.lengths.tolist()) == {1, 2, 3, 4, 5}
     assert evaluation.returns.tolist() == evaluation.lengths.tolist()
 
@@ -399,8 +390,5 @@ def test_choices_of_an_action_table_may_have_masks() -> None:
     spec = EnvironmentSpec(id="Pedals-v0", kwargs={"convention": "info"}, action_table=table)
     report = check_environment(spec, NO_MODULES, seconds=60.0, env_steps=20)
     assert (report.problems, report.env_steps) == ((), 20)
-    environments = make_environments(spec, 2)
-    try:
+    with closing(make_environments(spec, 2)) as environments:
         assert environments.reset(1).masks["action"].tolist() == [[True, False, False]] * 2
-    finally:
-        environments.close()

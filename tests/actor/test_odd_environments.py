@@ -1,6 +1,7 @@
 """Environments of users that keep to gymnasium's interface in ways that few do: they are checked and played."""
 
 import logging
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -79,8 +80,7 @@ def test_action_masks_may_be_lists_of_different_lengths_or_a_map(masks: str) -> 
     checked = spec(masks=masks)
     assert problems(checked) == ()
     assert not [note for note in gymnasium_notes(checked, MODULES) if "Error" in note]
-    environments = make_environments(checked, 2, modules=MODULES)
-    try:
+    with closing(make_environments(checked, 2, modules=MODULES)) as environments:
         observed = environments.reset(1)
         for _ in range(5):
             assert observed.masks["arm"].tolist() == [[True, False]] * 2
@@ -88,8 +88,6 @@ def test_action_masks_may_be_lists_of_different_lengths_or_a_map(masks: str) -> 
             observed, *_ = environments.step(
                 {"arm": np.zeros((2, 1), np.int64), "legs": np.array([[1, 0]] * 2)},
             )
-    finally:
-        environments.close()
 
 
 def test_close_that_fails_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
@@ -106,12 +104,9 @@ def test_close_that_fails_is_a_warning(caplog: pytest.LogCaptureFixture) -> None
 @pytest.mark.parametrize("processes", [False, True])
 def test_component_without_a_fixed_shape_can_be_left_out(processes: bool) -> None:
     checked = spec(extra=True).model_copy(update={"leave_out": ("notes",), "processes": processes})
-    environments = make_environments(checked, 2, modules=MODULES)
-    try:
+    with closing(make_environments(checked, 2, modules=MODULES)) as environments:
         assert environments.reset(1).frames["seen"].tolist() == [[0.0, 0.0]] * 2
         assert environments.step({"action": np.array([[0], [1]])})[1].tolist() == [1.0, 1.0]
-    finally:
-        environments.close()
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -163,3 +163,24 @@ def test_processes_are_new_interpreters_where_the_server_cannot_have_its_socket(
     folder.mkdir()
     parent, environments = started(tmp_path, TMPDIR=str(folder))
     assert [own_parent for own_parent, *_ in environments] == [parent, parent]
+
+
+INTERRUPTED = """
+import multiprocessing
+import signal
+from daedalus.actor.environments.environment_processes import _interrupts_blocked
+
+if __name__ == "__main__":
+    with _interrupts_blocked():
+        process = multiprocessing.get_context("spawn").Process(target=print)
+        process.start()
+        print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))
+    process.join()
+    print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such mask")
+def test_interrupts_stay_blocked_while_the_first_process_starts() -> None:
+    result = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["True", "False"]

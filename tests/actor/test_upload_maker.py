@@ -15,7 +15,7 @@ from daedalus.actor.errors import ActorError
 from daedalus.actor.session.upload_maker import RolloutUploadMaker, make_upload_maker
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed
-from daedalus.learner.serving.gradient_checks import restored
+from daedalus.learner.serving.upload_checks import restored
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits

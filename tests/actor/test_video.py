@@ -60,12 +60,18 @@ def test_mp4_has_every_frame_at_its_own_rate(tmp_path: Path) -> None:
         assert np.abs(picture.astype(int) - frame(number)).mean() < 12  # colours are stored at half the resolution
 
 
-def test_mp4_has_even_sizes(tmp_path: Path) -> None:
-    with Video(tmp_path / "film.mp4") as video:
-        video.add(frame(0, 41, 61), FrameRate())
-    assert read_mp4(tmp_path / "film.mp4")[0][0].shape == (40, 60, 3)
-    record(tmp_path / "small.mp4", 2, 30, width=30)
-    assert read_mp4(tmp_path / "small.mp4")[0][0].shape == (20, 30, 3)
+@pytest.mark.parametrize(
+    ("name", "given", "size"), [("film.mp4", (41, 61), (40, 60)), ("film.gif", (400, 640), (200, 320))]
+)
+def test_mp4_has_even_sizes_a_gif_is_small_and_both_have_a_width_that_is_given(
+    tmp_path: Path, name: str, given: tuple[int, int], size: tuple[int, int]
+) -> None:
+    read = read_mp4 if name.endswith("mp4") else read_gif
+    with Video(tmp_path / name) as video:
+        video.add(frame(0, *given), FrameRate())
+    assert read(tmp_path / name)[0][0].shape == (*size, 3)
+    record(tmp_path / f"small-{name}", 2, 30, width=30)
+    assert read(tmp_path / f"small-{name}")[0][0].shape == (20, 30, 3)
 
 
 @pytest.mark.parametrize(
@@ -81,14 +87,6 @@ def test_gif_keeps_every_nth_frame_and_the_total_duration(
     assert len(pictures) == len(kept)
     for picture, number in zip(pictures, kept, strict=True):
         np.testing.assert_array_equal(picture, frame(number))
-
-
-def test_gif_is_small_unless_a_width_is_given(tmp_path: Path) -> None:
-    with Video(tmp_path / "film.gif") as video:
-        video.add(np.zeros((400, 640, 3), np.uint8), FrameRate())
-    assert read_gif(tmp_path / "film.gif")[0][0].shape == (200, 320, 3)
-    record(tmp_path / "small.gif", 1, 30, width=30)
-    assert read_gif(tmp_path / "small.gif")[0][0].shape == (20, 30, 3)
 
 
 def test_gif_stores_only_the_pixels_that_change(tmp_path: Path) -> None:
@@ -195,15 +193,12 @@ def test_path_that_cannot_be_written_raises_when_the_block_begins(tmp_path: Path
             raise AssertionError("the block was entered")
 
 
-def test_unknown_suffix_is_reported_with_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(VideoError, match=r"must end with \.mp4 or \.gif, unlike 'film.avi'"):
-        Video(tmp_path / "film.avi")
-
-
 @pytest.mark.parametrize(("name", "package"), [("film.mp4", "av"), ("film.gif", "PIL")])
-def test_missing_package_is_reported_with_the_extra_to_install(
+def test_unknown_suffix_and_missing_package_is_reported_with_the_extra_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str
 ) -> None:
+    with pytest.raises(VideoError, match=r"must end with \.mp4 or \.gif, unlike 'film.avi'"):
+        Video(tmp_path / "film.avi")
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(VideoError, match=rf'need {package}: pip install "daedalus-rl\[video\]"'):
         Video(tmp_path / name)

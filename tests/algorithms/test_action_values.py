@@ -14,9 +14,8 @@ from torch.testing import assert_close
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.rollout_gradients import RolloutGradients
-from daedalus.learner.run.rollout_length import check_rollout_length
-from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.training.errors import CheckpointMismatchError
+from daedalus.learner.run.resuming import CheckpointMismatchError
+from daedalus.learner.run.settings import SettingsError, check_rollout_length
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NetworkError

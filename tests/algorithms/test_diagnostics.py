@@ -16,12 +16,9 @@ LOG_RATIOS = torch.tensor([math.log(TARGET[a] / BEHAVIOUR[a]) for a in ACTIONS])
 VALID = torch.tensor([[1.0], [1.0], [1.0], [1.0], [0.0]])
 
 
-def test_estimate_over_all_actions_in_proportion_is_the_exact_divergence() -> None:
+def test_estimate_over_all_actions_in_proportion_is_the_exact_divergence_and_never_negative() -> None:
     exact = sum(mu * math.log(mu / pi) for mu, pi in zip(BEHAVIOUR, TARGET, strict=True))
     assert behaviour_kl(LOG_RATIOS).item() == pytest.approx(exact, rel=1e-5)
-
-
-def test_estimate_is_never_negative_and_0_on_policy() -> None:
     for log_ratio in (-3.0, -0.1, 0.1, 3.0):
         assert behaviour_kl(torch.tensor([log_ratio])).item() > 0.0
     assert behaviour_kl(torch.zeros(50)).item() == 0.0
@@ -31,9 +28,6 @@ def test_effective_share_is_the_square_of_the_sum_over_the_sum_of_squares() -> N
     ratios = [TARGET[a] / BEHAVIOUR[a] for a in ACTIONS]
     expected = sum(ratios) ** 2 / (4 * sum(ratio**2 for ratio in ratios))
     assert effective_sample_share(LOG_RATIOS).item() == pytest.approx(expected, rel=1e-5)
-
-
-def test_effective_share_is_1_on_policy_and_one_row_if_one_row_outweighs_the_others() -> None:
     assert effective_sample_share(torch.zeros(6)).item() == pytest.approx(1.0)
     one = torch.tensor([500.0, 0.0, -3.0, 1.0])  # e^500 overflows float32
     assert effective_sample_share(one).item() == pytest.approx(1 / 4)
@@ -56,12 +50,6 @@ def test_diagnostics_of_a_batch() -> None:
     assert measured["value_error_p95"] == pytest.approx(2.85)
     assert measured["behaviour_kl"] == pytest.approx(behaviour_kl(LOG_RATIOS).item(), rel=1e-5)
     assert measured["rho_effective_share"] == pytest.approx(effective_sample_share(LOG_RATIOS).item())
-
-
-def test_uncorrected_algorithm_has_no_clipped_share() -> None:
     assert "rho_clipped_fraction" not in diagnostics(first_pass(torch.zeros(5, 1)), rho_clip=None)
-
-
-def test_batch_without_valid_rows_has_no_diagnostics() -> None:
-    empty = first_pass(torch.zeros(5, 1))._replace(valid=torch.zeros(5, 1))
-    assert diagnostics(empty, rho_clip=1.0) == {}
+    no_rows = first_pass(torch.zeros(5, 1))._replace(valid=torch.zeros(5, 1))
+    assert diagnostics(no_rows, rho_clip=1.0) == {}

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from building import POLICY, RECURRENT, SPACES, identity, make_rollout, make_rollouts, run_spec
 
-from daedalus.algorithms.errors import AlgorithmError
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.cli.commands.learner import learner_options, parser
 from daedalus.launch.learner_process import choose_run
@@ -18,6 +17,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
+from daedalus.protocol.algorithms import AlgorithmError
 from daedalus.protocol.compact import bfloat16, float32
 from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
 

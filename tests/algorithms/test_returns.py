@@ -1,14 +1,25 @@
-"""algorithms/returns.py against slow reference sums, by identities, and by hand-worked examples."""
+"""Returns and targets by hand and against the sums of the papers, and the weights of explored rows."""
 
 import pytest
 import torch
+from building import SPACES, join, make_rollout
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import Stream, lambda_return, n_step_return, vtrace, vtrace_advantage
 from torch import Tensor
 from torch.testing import assert_close
 
-from daedalus.algorithms.returns import actor_critic_targets, lambda_returns, vtrace_targets
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.gradients import GradientComputer
+from daedalus.algorithms.returns import (
+    actor_critic_targets,
+    lambda_returns,
+    lambda_targets,
+    vtrace_corrected_targets,
+    vtrace_targets,
+)
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 NUMBER = st.floats(-10.0, 10.0, width=32)
@@ -245,3 +256,92 @@ def test_truncation_bootstraps_and_termination_does_not_within_one_rollout() -> 
     targets = vtrace_targets(on_policy, rewards, discounts, values, next_values, truncated, 1.0, 1.0, 1.0)
     assert_close(targets.values[played], expected)
     assert_close(targets.advantages[played], expected - values[played])
+
+
+SPEC = TrainingSpec(discount_factor=0.9, trace_lambda=0.8, rho_clip=1.25, trace_clip=0.75)
+TERMINATED = [False, True, False, False, False, False]
+TRUNCATED = [False, False, False, False, True, False]
+VALID = [True, True, False, True, True, False]
+ROWS = len(VALID)
+
+
+@pytest.fixture
+def random() -> torch.Generator:
+    return torch.Generator().manual_seed(3)
+
+
+def flags(values: list[bool]) -> Tensor:
+    return torch.tensor(values)[:, None]
+
+
+def batch_of(rewards: Tensor, behaviour_log_probs: Tensor) -> Batch:
+    """Return one environment: an episode that terminates, one that a limit cuts, and the rows that only reset."""
+    return Batch(
+        observations={},
+        initial_state=torch.zeros(1, 0),
+        starts=flags([False, False, False, True, False, False, True]),
+        actions={},
+        masks={},
+        behaviour_log_probs=behaviour_log_probs,
+        rewards=rewards,
+        terminated=flags(TERMINATED),
+        truncated=flags(TRUNCATED),
+        valid=flags(VALID).float(),
+    )
+
+
+def test_targets_are_those_of_the_papers(random: torch.Generator) -> None:
+    rewards, target, behaviour = (torch.randn(ROWS, 1, generator=random) for _ in range(3))
+    values = torch.randn(ROWS + 1, 1, generator=random)
+    batch = batch_of(rewards, behaviour)
+    stream = Stream(
+        r=rewards[:, 0].tolist(),
+        V=values[:, 0].tolist(),
+        log_ratios=(target - behaviour)[:, 0].tolist(),
+        terminated=TERMINATED,
+        truncated=TRUNCATED,
+        valid=VALID,
+    )
+    assert max(stream.log_ratios) > 0.3 > -0.3 > min(stream.log_ratios)  # the clips bind in some rows only
+    uncorrected = lambda_targets(SPEC, batch, target, values)
+    corrected = vtrace_corrected_targets(SPEC, batch, target, values)
+    for t in stream.rows:
+        expected = lambda_return(stream, 0.9, 0.8, t)
+        assert uncorrected.values[t, 0].item() == pytest.approx(expected, abs=1e-5)
+        assert uncorrected.advantages[t, 0].item() == pytest.approx(expected - stream.V[t], abs=1e-5)
+        settings = (0.9, 0.8, 1.25, 0.75, t)
+        assert corrected.values[t, 0].item() == pytest.approx(vtrace(stream, *settings), abs=1e-5)
+        assert corrected.advantages[t, 0].item() == pytest.approx(vtrace_advantage(stream, *settings), abs=1e-5)
+    assert torch.equal(uncorrected.weights, torch.ones(ROWS, 1))
+    assert torch.equal(corrected.weights, (target - behaviour).exp().clamp(max=1.25))
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "a3c", "impala"])
+def test_rows_of_explored_actions_are_weighted_by_pi_over_mu(algorithm: str) -> None:
+    """The gradient of the policy loss, by loops over rows; the actions of the batch are the actor's own."""
+    torch.manual_seed(4)
+    spec = TrainingSpec(algorithm=algorithm, exploration=(0.4,), trace_lambda=0.9, value_coefficient=0.0)
+    network = ActorCritic(PolicySpec(hidden=(8,)), SPACES, training=spec)
+    with torch.no_grad():
+        network.policy_head.weight.mul_(200.0)
+    rollout = make_rollout(seed=5)
+    batch = join([rollout])
+    with torch.no_grad():
+        logits, _ = network(batch.observations, batch.initial_state, batch.starts)
+    policy = torch.distributions.Categorical(logits=logits[:-1])
+    actions = batch.actions["action"].squeeze(-1)
+    behaviour = 0.6 * policy.log_prob(actions).exp() + 0.4 / 4
+    batch.behaviour_log_probs.copy_(behaviour.log())
+    computer = GradientComputer(spec, network, SPACES)
+    list(computer.compute(batch, 0.0))
+    first = computer.take_first_pass()
+    assert first is not None
+    weights = (policy.log_prob(actions).exp() / behaviour).clamp(max=1.0)
+    assert weights.min() < 0.5
+    again, _ = network(batch.observations, batch.initial_state, batch.starts)
+    chosen = torch.distributions.Categorical(logits=again[:-1]).log_prob(actions)
+    rows = batch.valid > 0.0
+    loss = -(chosen * weights * first.advantages)[rows].mean()
+    expected = torch.autograd.grad(loss, network.learned_parameters(), materialize_grads=True)
+    flat = torch.cat([gradient.flatten() for gradient in expected])
+    torch.testing.assert_close(computer.parameters.gradients, flat, rtol=1e-4, atol=1e-6)

@@ -17,7 +17,7 @@ from daedalus.algorithms.gradient_inputs import GradientInputs, packed, unpacked
 from daedalus.algorithms.gradients import Terms
 from daedalus.algorithms.policy_gradient import PolicyGradient
 from daedalus.algorithms.rollout_gradients import RolloutGradients
-from daedalus.learner.serving.gradient_checks import gradient_violation, restored
+from daedalus.learner.serving.upload_checks import gradient_violation, restored
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.user_modules import UserModules

@@ -11,7 +11,7 @@ from daedalus.analysis.learning_curves import Series, evaluations, points, serie
 from daedalus.analysis.recorded_run import RETURN, RecordedRun, read_run
 from daedalus.analysis.run_groups import Group
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.run.run_directory import METRICS
 
 

@@ -17,7 +17,7 @@ from recorded_runs import record
 
 from daedalus.analysis import run_report
 from daedalus.cli.commands.report import report
-from daedalus.learner.run.event_file import EventFile
+from daedalus.learner.serving.events import EventFile
 from daedalus.protocol.messages import Event
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u202e\x00"

@@ -52,7 +52,7 @@ def test_the_sampler_names_its_extra(monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert sweep(["cartpole", *OVER, "--sampler"]) == 2
     assert capsys.readouterr().err == (
-        'daedalus sweep: --sampler needs Optuna, which is not installed: pip install "daedalus-rl[sweep]"\n'
+        'daedalus sweep: --sampler needs Optuna, which is not installed: pip install "daedalus-rl[analysis]"\n'
     )
 
 

@@ -183,7 +183,7 @@ def test_without_matplotlib_the_report_says_how_to_install_it(tmp_path: Path, mo
     search = grid(tmp_path)
     end, _ = make(search, Programs())
     text = report(tmp_path, search.planned, end, [LENGTH], ranked=False)
-    assert 'no picture: matplotlib is not installed: pip install "daedalus-rl[plot]"' in text
+    assert 'no picture: matplotlib is not installed: pip install "daedalus-rl[analysis]"' in text
     assert "rollout_length=20" in text
 
 

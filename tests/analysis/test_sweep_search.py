@@ -1,6 +1,6 @@
 """Test of analysis/sweep_search.py."""
 
-import json
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import pytest
 from planning import finish, planner
 
 from daedalus.analysis.sweep_plan import Choices, PlannedRun, Range
-from daedalus.analysis.sweep_search import TRIALS, GridSearch, SampledSearch, Search, score
+from daedalus.analysis.sweep_search import TRIALS, GridSearch, SampledSearch, Search, import_optuna, score
 from daedalus.learner.run.settings import SettingsError
 
 RATES = Range(key="training.learning_rate", low=1e-4, high=1e-1, whole=False)
@@ -16,10 +16,11 @@ HIDDEN = Choices(key="policy.hidden", values=("[16]", "[16,16]"))
 
 
 def make_runs(search: Search, result: Callable[[PlannedRun], float], most: int = 1000) -> list[PlannedRun]:
-    """Take and finish up to `most` runs; return them."""
+    """Take up to `most` runs, and finish those that have not ended; return them."""
     made = []
     while len(made) < most and (run := search.take()) is not None:
-        finish(run, evaluation=result(run))
+        if not run.directory.exists():
+            finish(run, evaluation=result(run))
         search.ended(run, failed=False)
         made.append(run)
     return made
@@ -76,6 +77,13 @@ class TestSampler:
         sampled = planner(folder, "--set", "training.stop_when_solved=false")
         return SampledSearch(sampled, [RATES, HIDDEN], range(1, 1 + seeds), trials=trials, folder=folder)
 
+    def trials(self, folder: Path) -> list[float | None]:
+        """Return the scores of the trials that Optuna keeps, None for those that are open."""
+        optuna = import_optuna()
+        backend = optuna.storages.journal.JournalFileBackend(str(folder / TRIALS))
+        study = optuna.load_study(study_name="sweep", storage=optuna.storages.JournalStorage(backend))
+        return [trial.value for trial in study.trials]
+
     def test_it_makes_all_seeds_of_each_point(self, tmp_path: Path) -> None:
         search = self.search(tmp_path)
         runs = make_runs(search, lambda run: 1.0)
@@ -98,7 +106,7 @@ class TestSampler:
     def test_the_mean_of_the_seeds_is_reported(self, tmp_path: Path) -> None:
         search = self.search(tmp_path, trials=2)
         make_runs(search, lambda run: float(run.seed))
-        assert [trial.value for trial in search._study.trials] == [1.5, 1.5]
+        assert self.trials(tmp_path) == [1.5, 1.5]
 
     def test_a_failed_point_is_not_reported(self, tmp_path: Path) -> None:
         search = self.search(tmp_path, trials=1)
@@ -108,37 +116,79 @@ class TestSampler:
         finish(second)
         search.ended(first, failed=True)
         search.ended(second, failed=False)
-        assert [trial.value for trial in search._study.trials] == [None]
+        assert self.trials(tmp_path) == [None]
         assert search.take() is None
 
     def test_an_interrupted_sweep_goes_on_with_the_same_points(self, tmp_path: Path) -> None:
         # Stop in the middle of the second of three random points: the third must not be the first again.
         before = make_runs(self.search(tmp_path, trials=9), lambda run: 1.0, most=3)
-        search = self.search(tmp_path, trials=9)
-        after = []
-        while (run := search.take()) is not None:
-            if not (run.directory / "summary.json").exists():
-                finish(run)
-            search.ended(run, failed=False)
-            after.append(run)
+        after = make_runs(self.search(tmp_path, trials=9), lambda run: 490.0)
         assert len(after) == 18
         assert [run.spec for run in after[:3]] == [run.spec for run in before]
         assert len({run.spec.training.learning_rate for run in after}) == 9
-        assert len([trial for trial in search._study.trials if trial.value is not None]) == 9
+        assert self.trials(tmp_path) == [1.0, (1.0 + 490.0) / 2, *[490.0] * 7]
 
-    def test_points_of_another_kind_of_range_are_not_reported(self, tmp_path: Path) -> None:
-        """The same setting with whole numbers, after a command whose range had fractions."""
-        (tmp_path / TRIALS).write_text(json.dumps({"trials": [{"training.discount_factor": "0.5"}]}))
-        whole = Range(key="training.discount_factor", low=0.0, high=1.0, whole=True)
-        search = SampledSearch(planner(tmp_path), [whole], [1], trials=2, folder=tmp_path)
-        make_runs(search, lambda run: 1.0, most=1)
-        assert search._study.trials == []
+    def test_a_point_that_was_being_chosen_as_the_machine_crashed_is_chosen_again(self, tmp_path: Path) -> None:
+        make_runs(self.search(tmp_path, trials=3), lambda run: 1.0, most=2)
+        whole = (tmp_path / TRIALS).read_text().splitlines(keepends=True)
+        chosen = next(index for index, line in enumerate(whole) if "policy.hidden" in line)
+        (tmp_path / TRIALS).write_text("".join(whole[:chosen]) + whole[chosen][:9])
+        runs = make_runs(self.search(tmp_path, trials=3), lambda run: 1.0)
+        assert [run.name for run in runs[::2]] == ["trial-002_seed-1", "trial-003_seed-1", "trial-004_seed-1"]
+        assert self.trials(tmp_path) == [None, 1.0, 1.0, 1.0]
 
-    def test_points_of_another_sweep_are_refused(self, tmp_path: Path) -> None:
-        for content in ({"trials": [{"training.learning_rate": "0.1"}]}, {"trials": 3}, {}):
-            (tmp_path / TRIALS).write_text(json.dumps(content))
-            with pytest.raises(SettingsError, match="is damaged, or is of a sweep over other settings"):
-                self.search(tmp_path)
-        (tmp_path / TRIALS).write_text("{")
-        with pytest.raises(SettingsError, match="is damaged: it is not valid JSON"):
+    def test_a_failed_point_is_tried_again(self, tmp_path: Path) -> None:
+        search = self.search(tmp_path, trials=1, seeds=1)
+        run = search.take()
+        assert run is not None
+        search.ended(run, failed=True)
+        assert [again.name for again in make_runs(self.search(tmp_path, trials=1, seeds=1), lambda _: 2.0)] == [
+            run.name
+        ]
+        assert self.trials(tmp_path) == [2.0]
+
+    def test_points_are_of_the_range_that_chose_them(self, tmp_path: Path) -> None:
+        before = make_runs(self.search(tmp_path, seeds=1), lambda run: 1.0, most=3)
+        narrow = Range(key=RATES.key, low=2e-4, high=2e-2, whole=False)
+        search = SampledSearch(
+            planner(tmp_path, "--set", "training.stop_when_solved=false"),
+            [narrow, HIDDEN],
+            [1],
+            trials=6,
+            folder=tmp_path,
+        )
+        again = make_runs(search, lambda run: 1.0)
+        assert [run.spec for run in again[:3]] == [run.spec for run in before]
+        assert all(2e-4 <= run.spec.training.learning_rate <= 2e-2 for run in again[3:])
+
+    def test_trials_of_another_sweep_are_refused(self, tmp_path: Path) -> None:
+        make_runs(self.search(tmp_path), lambda run: 1.0, most=1)
+        for axes in (
+            [RATES],
+            [RATES, Choices(key=HIDDEN.key, values=("[8]", "[16]"))],
+            [Range(key=RATES.key, low=1, high=1000, whole=True), HIDDEN],
+        ):
+            with pytest.raises(SettingsError, match="is of a sweep over other settings or other kinds of values"):
+                SampledSearch(planner(tmp_path), axes, [1], trials=2, folder=tmp_path)
+
+    @pytest.mark.parametrize("content", ["x\n", "{}\n", "[1]\n", '{"op_code": 4, "worker_id": "a"}\n'])
+    def test_damaged_trials_are_refused(self, tmp_path: Path, content: str) -> None:
+        (tmp_path / TRIALS).write_text(content * 2)
+        with pytest.raises(SettingsError, match=r"trials\.jsonl is damaged \(\w+\): choose another --folder"):
             self.search(tmp_path)
+
+    def test_trials_of_an_older_release_are_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "trials.json").write_text("{}")
+        with pytest.raises(SettingsError, match="is of a sweep of an older release"):
+            self.search(tmp_path)
+
+    def test_nothing_that_executes_reads_or_writes_the_trials(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def refuse(*_: object) -> None:
+            raise AssertionError
+
+        monkeypatch.setattr(pickle, "loads", refuse)
+        monkeypatch.setattr(pickle, "dumps", refuse)
+        make_runs(self.search(tmp_path, seeds=1), lambda run: 1.0, most=3)
+        assert len(make_runs(self.search(tmp_path, seeds=1), lambda run: 1.0)) == 6

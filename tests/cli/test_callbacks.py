@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from daedalus.launch.callbacks import Callback, CallbackObserver, TrainingRun, observed
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.user_metrics import MOST_METRICS, RowsWriter, UserMetrics
 
 

@@ -12,7 +12,7 @@ from statuses import actor_status, run_status
 from daedalus.cli.commands.status import status as status_command
 from daedalus.gateway.watching.learner_source import LearnerSource
 from daedalus.launch.prometheus_exporter import StatusCollector
-from daedalus.learner.reporting import report
+from daedalus.learner.reporting import run_reporter
 from daedalus.learner.run import heartbeat
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health
@@ -61,7 +61,7 @@ def server(operator: MemoryTransport) -> Iterator[ActorServer]:
     health = Health(started=0.0, updated=0.0, actor_seen=0.0)
 
     def status() -> RunStatus:
-        return report.run_status("r", EPOCH, spec, counters, opened.fleet, {}, health, 0, 1.0)
+        return run_reporter.run_status("r", EPOCH, spec, counters, opened.fleet, {}, health, 0, 1.0)
 
     transport = MemoryTransport(operator._network)
     opened = ActorServer("r", spec, transport, counters, status, learner_epoch=EPOCH, start_version=0, spaces=SPACES)
@@ -100,7 +100,7 @@ def test_actor_that_leaves_between_two_pages_costs_no_other(server: ActorServer,
     names = sorted(server.fleet.actors)
     report = query(operator, b"")
     assert isinstance(report, StatusReport)
-    assert [actor.actor for actor in report.status.actors] == names[:PAGE_ACTORS]
+    assert [actor.actor for actor in run_reporter.status.actors] == names[:PAGE_ACTORS]
     for name in (names[5], names[PAGE_ACTORS - 1]):
         del server.fleet.actors[name]
     more = query(operator, encode(ActorsRequest(after=names[PAGE_ACTORS - 1])))
@@ -140,7 +140,7 @@ def test_events_of_the_longest_texts_fit_the_limits_of_their_reader() -> None:
 def test_page_after_the_last_actor_is_empty(server: ActorServer, operator: MemoryTransport) -> None:
     report = query(operator, encode(ActorsRequest(after="zzz")))
     assert isinstance(report, ActorsReport)
-    assert report.page == ActorsPage(learner_epoch=EPOCH, actors=())
+    assert run_reporter.page == ActorsPage(learner_epoch=EPOCH, actors=())
 
 
 @pytest.mark.parametrize("payload", [b"x", encode(Join(actor="a", incarnation=1)), b"x" * 5000])

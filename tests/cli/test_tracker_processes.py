@@ -18,7 +18,7 @@ from daedalus.launch import tracker_processes
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 
 NAMES = ("wandb", "mlflow", "trackio")
 
@@ -174,3 +174,21 @@ def test_a_tracker_that_is_not_installed_is_reported_and_left_out(
         "--log mlflow: not installed, and the run goes on without it; "
         "install it with: pip install 'daedalus-rl[mlflow]'"
     ]
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("", "own_writer.py has no 'Writer'"),
+        ("import absent_package", "own_writer.py imports absent_package, which is not installed"),
+        ("class Writer:\n def __init__(self, run): raise ValueError('no place')", "ValueError: no place"),
+    ],
+)
+def test_a_fault_of_a_writer_of_the_users_is_reported_once(
+    code: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own_writer.py").write_text(code)
+    (shown,) = log(record(tmp_path / "run"), "own_writer:Writer")
+    assert reason in shown
+    assert len(warnings()) == 1  # that it has not received the whole run

@@ -1,6 +1,5 @@
 """Test of deploy/kubernetes: manifests against the schemas of Kubernetes, commands against our parsers."""
 
-import copy
 import os
 import re
 import shlex
@@ -69,23 +68,6 @@ def test_the_kustomizations_name_every_manifest() -> None:
     written.remove(FOLDER / "reader.yaml")  # applied by hand
     documents = [each for path in written for each in yaml.safe_load_all(path.read_text())]
     assert len(documents) == len(ALL)
-    assert set(ALL) == {
-        "Service/router",
-        "Deployment/router",
-        "PersistentVolumeClaim/runs",
-        "Job/learner",
-        "PodDisruptionBudget/actor",
-        "Deployment/actor",
-        "Deployment/evaluator",
-        "NetworkPolicy/router",
-        "NetworkPolicy/clients",
-        "HorizontalPodAutoscaler/actor",
-        "Service/exporter",
-        "Deployment/exporter",
-        "NetworkPolicy/exporter",
-        "ServiceMonitor/daedalus",
-        "PrometheusRule/daedalus",
-    }
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -100,20 +82,6 @@ def test_the_reader_is_valid_and_mounts_the_runs() -> None:
     (volume,) = reader["spec"]["volumes"]
     assert f"PersistentVolumeClaim/{volume['persistentVolumeClaim']['claimName']}" in ALL
     assert reader["spec"]["containers"][0]["image"] in {container["image"] for _, container in containers()}
-
-
-@pytest.mark.parametrize("broken", ["unknown field", "wrong type", "missing field"])
-def test_a_broken_manifest_is_invalid(broken: str) -> None:
-    manifest = copy.deepcopy(ALL["Deployment/actor"])
-    container = manifest["spec"]["template"]["spec"]["containers"][0]
-    if broken == "unknown field":
-        container["argz"] = container.pop("args")
-    elif broken == "wrong type":
-        manifest["spec"]["replicas"] = "two"
-    else:
-        del manifest["spec"]["selector"]
-    with pytest.raises(kubernetes_validate.ValidationError):
-        kubernetes_validate.validate(manifest, VERSIONS[-1], strict=True)
 
 
 def test_each_selector_matches_pod_templates() -> None:

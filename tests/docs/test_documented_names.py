@@ -1,14 +1,21 @@
-"""Links, files, settings and functions that the documentation names exist."""
+"""Names and the wire format that the documentation shows are those of the code."""
 
-import ast
+import dataclasses
 import re
+import subprocess
+import sys
+import typing
 from pathlib import Path
 
 import pytest
 from pages import DOCS, PAGES, ROOT, code_blocks, inline_code, name_of
 from pydantic import BaseModel
 
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol import messages
+from daedalus.protocol.algorithms import ActorDemands
+from daedalus.protocol.codec import PROTOCOL_VERSION
+from daedalus.protocol.messages import ActorStatus, Event, EventKind, RunStatus
+from daedalus.protocol.spec import ActorSpec, CollectionSpec, EnvironmentSpec, EvaluatorSpec, LearningSpec, RunSpec
 from daedalus.transport.credentials import CERTIFICATE, CLIENTS, KEY
 
 FOLDERS = (
@@ -68,22 +75,86 @@ def test_the_messages_about_certificates_are_those_of_the_code() -> None:
             assert words in sources, message
 
 
-def test_the_way_of_a_rollout_names_functions_that_exist() -> None:
-    """At most 20 functions; `file.py` `Class.function` or `function`, each defined in that file."""
-    section = (DOCS / "architecture.md").read_text("utf-8").split("## A rollout's way")[1].split("\n## ")[0]
-    steps = re.findall(r"^(\d+)\. `([\w/]+\.py)` `([\w.]+)`: ", section, re.MULTILINE)
-    assert [int(number) for number, _, _ in steps] == list(range(1, len(steps) + 1))
-    assert len(re.findall(r"^\d+\. ", section, re.MULTILINE)) == len(steps)
-    assert 10 <= len(steps) <= 20
-    for _, path, name in steps:
-        assert name in defined(ROOT / path), f"{path} {name}"
+def test_the_files_to_open_have_what_is_named_in_them() -> None:
+    """The tables of docs/architecture.md name a function or class of a file as `path` (`name`)."""
+    named = re.findall(r"`([\w/]+\.py)` \(`([\w.]+)`\)", (DOCS / "architecture.md").read_text("utf-8"))
+    assert len(named) > 5
+    for path, name in named:
+        pattern = rf"^\s*(class|def) {name.rpartition('.')[2]}\b|^{name} = "
+        assert re.search(pattern, (ROOT / path).read_text("utf-8"), re.MULTILINE), f"{path} {name}"
 
 
-def defined(path: Path) -> set[str]:
-    """Return the functions of a file, methods as `Class.method`."""
-    body = ast.parse(path.read_text("utf-8")).body
-    classes = [node for node in body if isinstance(node, ast.ClassDef)]
-    functions = {node.name for node in body if isinstance(node, ast.FunctionDef)}
-    return functions | {
-        f"{owner.name}.{node.name}" for owner in classes for node in owner.body if isinstance(node, ast.FunctionDef)
-    }
+def test_the_way_of_a_rollout_is_the_one_that_is_traced() -> None:
+    """See docs/trace_rollout.py, which names what is missing and what is superfluous."""
+    command = [sys.executable, str(DOCS / "trace_rollout.py"), "--check"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+WIRE = (DOCS / "wire.md").read_text("utf-8")
+TABLES = ["Join", "Welcome", "Refusal", "Program", "Snapshot", "Rollout", "Gradient", "Acknowledgement"]
+TABLES += ["RunEnded", "SnapshotRequest", "SnapshotPart", "CompactSnapshot", "EvaluationReport", "ClientReport"]
+
+
+def first_column(table: str) -> set[str]:
+    """Return the names in the first column of a table's rows, `weights/NAME` as `weights`."""
+    rows = re.findall(r"^\|((?: `[\w/]+`,?)+) \|", table, re.MULTILINE)
+    return {name.split("/")[0] for row in rows for name in re.findall(r"`([\w/]+)`", row)}
+
+
+def table_after(start: str) -> str:
+    """Return the first table that follows a text."""
+    _, found, rest = WIRE.partition(start)
+    assert found, start
+    table = re.search(r"^\|.*?(?=\n\n|\Z)", rest, re.DOTALL | re.MULTILINE)
+    assert table
+    return table[0]
+
+
+def table_under(head: str) -> str:
+    """Return the rows of the table whose head begins so."""
+    _, found, rest = WIRE.partition(f"\n{head}")
+    assert found, head
+    return rest.partition("\n\n")[0]
+
+
+@pytest.mark.parametrize("message", TABLES)
+def test_a_messages_table_has_its_fields(message: str) -> None:
+    fields = {field.name for field in dataclasses.fields(getattr(messages, message))}
+    assert first_column(table_after(f"**{message}**")) == fields
+
+
+def test_every_message_is_on_the_page() -> None:
+    for message in typing.get_args(messages.Message):
+        assert f"{message.__name__}" in WIRE
+
+
+@pytest.mark.parametrize(("message", "field"), [("Refusal", "code"), ("Acknowledgement", "verdict")])
+def test_codes_and_verdicts_are_all_explained(message: str, field: str) -> None:
+    words = typing.get_args(typing.get_type_hints(getattr(messages, message))[field])
+    table = table_under("| code |") if field == "code" else table_after("### Verdicts")
+    assert first_column(table) == set(words)
+
+
+def test_the_status_tables_have_its_fields() -> None:
+    assert first_column(table_under("| of the run |")) == set(RunStatus.model_fields)
+    assert first_column(table_under("| of each actor |")) == set(ActorStatus.model_fields)
+    assert first_column(table_under("| of each event |")) == set(Event.model_fields)
+    kinds = table_under("| of each event |").partition("| `kind` |")[2].partition("\n")[0]
+    assert tuple(re.findall(r"`(\w+)`", kinds)) == typing.get_args(EventKind)
+
+
+def test_the_specifications_tables_have_what_an_actor_needs() -> None:
+    environment = first_column(table_under("| `environment.` |")) | {"backend", "processes"}  # named in the row of `id`
+    assert environment == set(EnvironmentSpec.model_fields)
+    assert first_column(table_under("| `collection.` |")) == set(CollectionSpec.model_fields) - {"actors"}
+    spec = table_under("| `spec.` |")
+    assert first_column(spec) == set(ActorSpec.model_fields)
+    for name, part in (("evaluation", EvaluatorSpec), ("algorithm", ActorDemands), ("learning", LearningSpec)):
+        row = spec.partition(f"| `{name}` |")[2].partition("\n")[0]
+        assert set(part.model_fields) <= set(re.findall(r"`(\w+)`", row))
+
+
+def test_the_page_is_for_this_version() -> None:
+    assert f"protocol version **{PROTOCOL_VERSION}**" in WIRE
+    assert f"`tests/protocol/golden/v{PROTOCOL_VERSION}/`" in WIRE

@@ -1,7 +1,9 @@
 """The examples of the guides work as they are printed."""
 
 import importlib
+import json
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +12,14 @@ from allowed_modules import TEST_MODULES
 from building import SPACES, make_rollouts
 from pages import DOCS, code_blocks
 from plain import PlainEnvironments, act, choices, plain_spaces
+from recorded_runs import record
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.launch.callbacks import TrainingRun
+from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.run_choice import with_record
-from daedalus.learner.reporting.metrics import Details, MetricsWriter
+from daedalus.launch.tracker_processes import TrackerProcesses
+from daedalus.learner.reporting.trackers.tracker import tracker_name
 from daedalus.learner.run.settings import choose_algorithm, read_settings, run_spec
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -100,12 +105,16 @@ def test_the_algorithm_of_action_values_learns(folder: Path) -> None:
 
 
 def test_the_metrics_writer_writes(folder: Path) -> None:
-    (folder / "json_lines.py").write_text(example("metrics_writer.md"))
-    sys.path.append(str(folder))
-    writer: MetricsWriter = importlib.import_module("json_lines").JsonLinesWriter(folder / "metrics.jsonl")
-    writer.write({"env_steps": 1.0}, Details())
-    writer.close()
-    assert (folder / "metrics.jsonl").read_text() == '{"env_steps": 1.0}\n'
+    (folder / "my_writer.py").write_text(example("metrics_writer.md"))
+    directory, lines = record(folder / "run"), list[str]()
+    with ChildOutput(directory / "output.log", lines.append, lines.append) as output:
+        trackers = TrackerProcesses([tracker_name("my_writer:JsonLines")], directory, output)
+        trackers.start()
+        trackers.finish(threading.Event())
+    assert lines == ["my_writer:JsonLines: metrics go to my_writer:JsonLines"]
+    rows = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
+    assert [row["env_steps"] for row in rows] == [1000, 2000, 3000]
+    assert rows[1]["episode_return_mean"] == 300.0
 
 
 def test_the_callback_ends_training_on_a_plateau(folder: Path) -> None:

@@ -7,10 +7,9 @@ import sys
 import pytest
 from pages import DOCS, ROOT
 
-from daedalus.cli.command_table import COMMANDS
+from daedalus.cli.command_table import COMMANDS, USAGE
 from daedalus.cli.commands.settings import Setting, all_settings
-from daedalus.cli.main import USAGE
-from daedalus.learner.reporting.metrics import GROUPS
+from daedalus.learner.reporting.metrics_rows import GROUPS
 
 SETTINGS = {setting.path: setting for setting in all_settings()}
 

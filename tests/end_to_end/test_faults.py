@@ -6,6 +6,7 @@ import random
 import resource
 import signal
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -67,8 +68,7 @@ def test_an_actor_continues_without_a_restart_after_its_link_stalled(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     learner()
-    proxy = StallingProxy(address)
-    try:
+    with closing(StallingProxy(address)) as proxy:
         start("actor", "--connect", proxy.address, "--name", "remote")
         wait_for_training(status, "remote")
         proxy.stall()
@@ -76,8 +76,6 @@ def test_an_actor_continues_without_a_restart_after_its_link_stalled(
         proxy.resume()
         wait_for_training(status, "remote")
         assert actor_status(status(), "remote")["lives"] == 1
-    finally:
-        proxy.close()
 
 
 def test_an_actor_that_sends_nan_rewards_is_quarantined_and_prints_the_reason(
@@ -205,8 +203,7 @@ def test_a_learner_serves_again_after_its_link_to_the_router_stalled(
     start: Start, address: str, status: Status, router: Callable[[], Running]
 ) -> None:
     router()
-    proxy = StallingProxy(address)
-    try:
+    with closing(StallingProxy(address)) as proxy:
         start("learner", "cartpole", "--connect", proxy.address, "--run-dir", "run", *ENDLESS)
         start("actor", "--connect", address, "--name", "loyal")
         wait_for_training(status, "loyal")
@@ -214,8 +211,6 @@ def test_a_learner_serves_again_after_its_link_to_the_router_stalled(
         until(lambda: status() == {})
         proxy.resume()
         wait_for_training(status, "loyal")
-    finally:
-        proxy.close()
 
 
 # ------------------------------------------------------------------------------- hostile senders

@@ -5,6 +5,7 @@ import shutil
 import socket
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -30,14 +31,11 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Transport]:
     with starting(tmp_path_factory.mktemp("learner")) as start:
         learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
         learner.expect("actors join with")
-        transport = connect([address])
-        try:
+        with closing(connect([address])) as transport:
             # The key that the learner serves last.
             until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))
             yield transport
             assert learner.process.poll() is None, learner.output
-        finally:
-            transport.close()
 
 
 def ask(transport: Transport, key: str, payload: bytes) -> Message:
@@ -91,8 +89,7 @@ def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(
 
 
 def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str) -> None:
-    router = listen([address])
-    try:
+    with closing(listen([address])) as router:
         first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
         first.expect("actors join with")
         until(lambda: router.query(keys.join("run", "client"), timeout=30.0))
@@ -100,8 +97,6 @@ def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str)
         assert second.wait() == 1
         second.expect("another learner already serves run 'run': stop that learner, or rename this run")
         assert first.process.poll() is None
-    finally:
-        router.close()
 
 
 def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_the_reason(
@@ -111,8 +106,7 @@ def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_th
     learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run")
     learner.expect("the first actor decides the spaces of the run, because .* cannot import slow_environment")
     learner.expect("actors join with")
-    transport = connect([address])
-    try:
+    with closing(connect([address])) as transport:
         until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))
         other = CARTPOLE.model_copy(update={"actions": {"action": DiscreteSpace(counts=(3,))}})
         assert isinstance(ask(transport, keys.join("run", "client"), join(spaces=other, environments=2)), Welcome)
@@ -122,5 +116,3 @@ def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_th
         actor.expect("refused.*2 choices.*but this run has.*3 choices")
         listed = rf"refused: .* \({re.escape(socket.gethostname())}, daedalus-rl .*\), 1 x, .* 2 choices, but this run"
         start("status", "--connect", address, "--run", "run").expect(listed)
-    finally:
-        transport.close()

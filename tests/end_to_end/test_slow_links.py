@@ -1,6 +1,9 @@
-"""Test of an actor on a slow link: 1 Mbit/s up, 4 Mbit/s down, 100 ms in each direction."""
+"""Actors on a slow link, and with slow environments."""
 
+import shutil
 from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 from faults import SlowProxy
@@ -22,8 +25,7 @@ def far(start: Start, address: str) -> Callable[[], dict]:
 def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
     start: Start, address: str, far: Callable[[], dict]
 ) -> None:
-    proxy = SlowProxy(address, up=125e3, down=500e3, delay=0.1)
-    try:
+    with closing(SlowProxy(address, up=125e3, down=500e3, delay=0.1)) as proxy:
         actor = start("actor", "--connect", proxy.address, "--name", "far")
         actor.expect("slow link: .* fetching compact snapshots")
         until(lambda: far().get("rollouts_accepted", 0) > 20)
@@ -32,8 +34,6 @@ def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
         assert report["rollouts_missed"] == 0
         assert "unfit" not in report["rollouts_rejected"]
         until(lambda: 0 < far().get("bytes_down_per_hour", 0) < 3600 * 500e3)
-    finally:
-        proxy.close()
 
 
 def test_an_actor_with_link_wan_keeps_receiving_new_weights(
@@ -45,3 +45,30 @@ def test_an_actor_with_link_wan_keeps_receiving_new_weights(
     report = far()
     assert report["compact_snapshots"]
     assert sum(report["rollouts_rejected"].values()) < report["rollouts_accepted"]
+
+
+def test_slow_actors_wait_for_a_stopped_learner_and_leave_a_finished_run(
+    start: Start, address: str, tmp_path: Path
+) -> None:
+    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
+    # An actor's rollout of 64 env_steps takes 0.26 s.
+    sizes = ("collection.envs_per_actor=2", "collection.rollout_length=32", "service.log_seconds=0.1")
+    settings = [word for each in sizes for word in ("--set", each)]
+    words = ("learner", "--env", "slow_environment:Slow-v0", "--listen", address, *settings, "--run-dir", "run")
+    allowing = ("--allow-module", "slow_environment")
+    learner = start(*words, "--env-steps", 10**9)
+    actors = [start("actor", "--connect", address, "--name", name, *allowing) for name in ("a", "b")]
+    for actor in actors:
+        actor.expect("joined run")
+    learner.expect(r"updates .*/s")
+    learner.process.terminate()
+    assert learner.wait() == 0, learner.output
+    saved = learner.expect(r"stopped; checkpoint saved at ([\d,]+) env_steps: run/checkpoints/0").group(1)
+    for actor in actors:
+        actor.expect("the learner was stopped; waiting for it to return")
+    resumed = start(*words, "--env-steps", int(saved.replace(",", "")) + 600, "--resume")
+    resumed.expect("resuming from checkpoint")
+    assert resumed.wait() == 0, resumed.output
+    for actor in actors:
+        assert actor.wait() == 0, actor.output
+        actor.expect("the run is over")

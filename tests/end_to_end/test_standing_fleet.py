@@ -81,8 +81,7 @@ def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release
     start: Start, address: str, tmp_path: Path
 ) -> None:
     shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
-    router = listen([address])
-    try:
+    with closing(listen([address])):
         actor = start("actor", "--connect", address, "--name", "standing", "--envs", 4, "--stay")
         newer = bytearray(encode(Refusal(code="not_ready", reason="")))
         newer[4] += 1  # the version
@@ -98,5 +97,3 @@ def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release
         assert second.wait() == 3, second.output
         actor.expect("waiting for the next run")
         assert actor.process.poll() is None
-    finally:
-        router.close()

@@ -12,7 +12,7 @@ import pytest
 from lucky_environment import BUSY, UNLUCKY, WAITING
 from processes import Running, free_address, processes_mentioning, until
 
-from daedalus.learner.run.event_file import read_events
+from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
 SIZES = ("collection.actors=1", "collection.envs_per_actor=2", "collection.rollout_length=8", "training.minibatches=1")

@@ -15,8 +15,8 @@ import safetensors.numpy
 from processes import Running, listening_ports, processes_mentioning, starting, until
 from trackers import wandb_run
 
-from daedalus.learner.run.event_file import read_events
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
+from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
 SHORT = ("--set", "collection.envs_per_actor=2", "--set", "evaluation.final_episodes=1")

@@ -6,6 +6,7 @@ import json
 import os
 import struct
 import sys
+from contextlib import closing
 from ctypes.util import find_library
 from io import BytesIO
 from pathlib import Path
@@ -89,12 +90,9 @@ def test_of_very_many_choices_the_likely_ones_are_shown() -> None:
 
 
 def test_an_episode_is_played_with_pictures() -> None:
-    camera = EpisodeCamera(SPEC.for_actors(), NO_MODULES)
-    try:
+    with closing(EpisodeCamera(SPEC.for_actors(), NO_MODULES)) as camera:
         moments = list(camera.play(runtime()))
         again = next(camera.play(runtime()))
-    finally:
-        camera.close()
     assert [moment.step for moment in moments] == list(range(1, len(moments) + 1))
     assert moments[-1].total == len(moments)
     assert again.step == 1
@@ -110,14 +108,11 @@ def test_mujoco_is_rendered_without_a_display(monkeypatch: pytest.MonkeyPatch) -
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
     spec = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "InvertedPendulum-v5"})})
-    camera = EpisodeCamera(spec.for_actors(), NO_MODULES)
-    try:
+    with closing(EpisodeCamera(spec.for_actors(), NO_MODULES)) as camera:
         policy = Policy.of(spec.policy, camera.spaces)
         acting = OnnxRuntime(policy.model)
         acting.load({name: value.detach().numpy() for name, value in policy.network.named_parameters()})
         moment = next(camera.play(acting))
-    finally:
-        camera.close()
     assert moment.picture.std() > 1.0, "a picture, not one colour"
     assert len(moment.actions[0]["numbers"]) == 1
 

@@ -16,11 +16,10 @@ from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
 from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.gateway import connection, policy_versions, server
-from daedalus.gateway import gateway as gateway_module
+from daedalus.gateway import client_gateway, connection, policy_versions, server
 from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.client_gateway import Gateway
 from daedalus.gateway.client_messages import Act
-from daedalus.gateway.gateway import Gateway
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, PolicyError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -238,7 +237,7 @@ def test_silent_client_holds_up_nobody_and_loses_its_version_when_memory_is_need
 ) -> None:
     monkeypatch.setattr(policy_versions, "_MIN_VERSIONS", 2)
     monkeypatch.setattr(policy_versions, "_VERSION_BYTES", 0)
-    monkeypatch.setattr(gateway_module, "_SLOW_SECONDS", 0.5)
+    monkeypatch.setattr(client_gateway, "_SLOW_SECONDS", 0.5)
     silent, busy = connect(), connect()
     silent.hello("silent")
     silent.act([0.0, 0.0, 0.0, 0.0])  # it now holds version 0
@@ -345,7 +344,7 @@ def test_client_waits_for_a_learner(network: MemoryNetwork, connect: Connect) ->
 def test_client_that_disconnects_while_it_waits_for_a_learner_leaves_its_name(
     gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gateway_module, "JOIN_SECONDS", 1e6)
+    monkeypatch.setattr(client_gateway, "JOIN_SECONDS", 1e6)
     client = connect()
     client.send("hello", version=1, name="early", **CARTPOLE)
     client.send("act", observation=[0.0, 0.0, 0.0, 0.0])
@@ -442,7 +441,7 @@ def test_clients_act_while_the_link_takes_no_presence(
 
 
 def test_client_is_told_that_no_learner_came(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway_module, "JOIN_SECONDS", 0.3)
+    monkeypatch.setattr(client_gateway, "JOIN_SECONDS", 0.3)
     client = connect()
     error = client.hello("early")
     assert error["code"] == "unavailable"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gateways import JsonClient, RunningGateway
 from gymnasium import spaces as gym
-from scripted_learner import Policy, ScriptedLearner
+from scripted_learner import SPACES, Policy, ScriptedLearner
 
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.gateway.client_actor import ClientActor
@@ -336,3 +336,40 @@ def test_images_of_a_camera_are_not_too_large() -> None:
         "camera": (84, 84),
         "bytes": (9000, 4),
     }
+
+
+SPEC = RunSpec.model_validate(
+    {
+        "environment": {"id": "CartPole-v1"},
+        "collection": {"rollout_length": 48},
+        "training": {"algorithm": "n_step_q"},
+    }
+)
+EPSILONS = {"careful": 0.0, "curious": 0.5}
+
+
+def test_each_client_explores_with_its_own_epsilon(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network, SPEC, policy=Policy.of(PolicySpec(), SPACES, SPEC.training))
+    learner.epsilons = EPSILONS
+    learner.publish(0)
+    gateway = RunningGateway(network)
+    clients = {name: JsonClient(gateway.port) for name in EPSILONS}
+    try:
+        for name, client in clients.items():
+            client.hello(name)
+        for step in range(49):
+            for client in clients.values():
+                client.send("act", observation=[math.sin(step), 0.0, 0.1, 0.0])
+            for client in clients.values():
+                assert client.receive()["action"] in (0, 1)
+        rollouts = {rollout.identity.actor: rollout for rollout, _ in (learner.receive(), learner.receive())}
+    finally:
+        for client in clients.values():
+            client.close()
+        gateway.close()
+        learner.transport.close()
+    assert (rollouts["careful"].behaviour_log_probs == 0.0).all()
+    is_random = np.isclose(rollouts["curious"].behaviour_log_probs, math.log(0.25), atol=1e-5)
+    is_greedy = np.isclose(rollouts["curious"].behaviour_log_probs, math.log(0.75), atol=1e-5)
+    assert (is_random | is_greedy).all()
+    assert 0 < is_random.mean() < 0.6

@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -134,13 +135,10 @@ def test_three_pages_that_play_are_three_actors_that_the_run_learns_from(
         page.locator("#fast").check()
     names = {page.locator("#name").input_value() for page in pages}
     assert len(names) == 3
-    transport = connect([run[0].learner])
-    try:
+    with closing(connect([run[0].learner])) as transport:
         until(lambda: names <= {one.actor for status in ask(transport) for one in status.actors if one.env_steps > 0})
         played = [one for one in ask(transport)[0].actors if one.actor in names]
         assert not {cause for one in played for cause in one.rollouts_rejected} - {"stale"}
-    finally:
-        transport.close()
     assert all("Playing as" in text_of(page, "#status") for page in pages)
 
 
@@ -257,8 +255,7 @@ def test_play_beyond_loopback_needs_the_token_of_its_name(
     network: MemoryNetwork, learner: ScriptedLearner, visit: Open, tmp_path: Path
 ) -> None:
     folder = make_certificates(tmp_path / "certs", "gateway", "client phone")
-    running = RunningGateway(network, folder / "gateway")
-    try:
+    with closing(RunningGateway(network, folder / "gateway")) as running:
         # The test does not install the CA in the browser, as the visitor of a phone would.
         page = visit(f"https://127.0.0.1:{running.port}/play", ignore_https_errors=True).page
         page.wait_for_selector("#status:has-text('Not playing: the token is not one of this name')")
@@ -271,8 +268,6 @@ def test_play_beyond_loopback_needs_the_token_of_its_name(
         assert rollout.identity.actor == "phone"
         assert rollout.rewards.tolist() == [[1.0]] * len(rollout.rewards)
         page.close()  # it would try to connect to a gateway that is closed, which its console reports
-    finally:
-        running.close()
 
 
 def test_a_thousand_actors_are_aggregated_filtered_and_sorted_by_keyboard(gateway: RunningGateway, visit: Open) -> None:

@@ -10,7 +10,7 @@ from gateways import RunningGateway
 from processes import LIMIT
 from scripted_learner import ScriptedLearner
 
-from daedalus.gateway import gateway as gateway_module
+from daedalus.gateway import client_gateway as gateway_module
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import RunEnded

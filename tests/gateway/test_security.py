@@ -16,6 +16,7 @@ import urllib.request
 import weakref
 from asyncio.transports import BaseTransport
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -219,16 +220,13 @@ def test_connection_without_a_tls_handshake_is_closed(
     network: MemoryNetwork, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "_REQUEST_SECONDS", 0.3)
-    running = RunningGateway(network, folder / "gateway", follows=False)
-    try:
+    with closing(RunningGateway(network, folder / "gateway", follows=False)) as running:
         address = ("127.0.0.1", running.port)
         with (
             socket.create_connection(address, LIMIT / 4) as silent,  # asyncio's own limit is 60 s
             contextlib.suppress(ConnectionResetError),
         ):
             assert silent.recv(1) == b""
-    finally:
-        running.close()
 
 
 def test_large_first_messages_that_do_not_end_are_limited_and_the_oldest_ends(
@@ -270,8 +268,7 @@ def test_of_silent_connections_the_oldest_give_way_and_clients_stay(
 ) -> None:
     monkeypatch.setattr(server, "_REQUEST_SECONDS", 1e6)
     monkeypatch.setattr(server, "most_connections", lambda: 12)
-    running = RunningGateway(network, folder / "gateway" if secure else None)
-    try:
+    with closing(RunningGateway(network, folder / "gateway" if secure else None)) as running:
         connect = functools.partial(secure_client, running, folder) if secure else lambda: JsonClient(running.port)
         known, given = connect(), token(folder, "phone") if secure else ""
         assert known.hello("phone.1", token=given)["type"] == "welcome"
@@ -282,8 +279,6 @@ def test_of_silent_connections_the_oldest_give_way_and_clients_stay(
         assert known.act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
         for client in (known, late, *waiting):
             client.close()
-    finally:
-        running.close()
 
 
 def test_address_with_the_most_silent_connections_gives_way_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,8 +338,7 @@ def test_one_token_does_not_shut_out_others(
     network: MemoryNetwork, folder: Path, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(app, "MAX_CLIENTS", 3)
-    running = RunningGateway(network, folder / "gateway")
-    try:
+    with closing(RunningGateway(network, folder / "gateway")) as running:
         phone, arm = token(folder, "phone"), token(folder, "arm")
         greedy = [secure_client(running, folder) for _ in range(3)]
         for number, client in enumerate(greedy):
@@ -358,8 +352,6 @@ def test_one_token_does_not_shut_out_others(
         assert greedy[0].act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
         for client in greedy:
             client.close()
-    finally:
-        running.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="only root can be another user")
@@ -504,16 +496,14 @@ def test_client_that_reads_neither_answers_nor_pings_is_disconnected(
         "connection_made",
         lambda channel, transport: made.append(channel) or connection_made(channel, transport),
     )
-    client = JsonClient(gateway.port, sock=deaf_socket(gateway.port), max_queue=1, close_timeout=1.0)  # nobody answers
-    try:
+    # Nobody answers.
+    with closing(JsonClient(gateway.port, sock=deaf_socket(gateway.port), max_queue=1, close_timeout=1.0)) as client:
         assert client.hello("deaf")["type"] == "welcome"
         for _ in range(1000):
             client.send("act", observation=[0.0, 0.0, 0.0, 0.0])
         until(lambda: gateway.call(lambda: made[0].transport.get_write_buffer_size()) > 0)
         gateway.call(made[0].keepalive_timeout)
         until(lambda: not gateway.call(lambda: gateway.gateway._seats))
-    finally:
-        client.close()
 
 
 def test_ended_connections_are_forgotten(

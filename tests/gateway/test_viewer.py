@@ -7,7 +7,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, closing, nullcontext
 from email.message import Message
 from pathlib import Path
 from typing import Any
@@ -267,8 +267,7 @@ def test_other_files_are_not_served(gateway: RunningGateway, path: str) -> None:
 
 
 def test_gateway_of_a_page_takes_no_clients(network: MemoryNetwork) -> None:
-    running = RunningGateway(network, follows=False, takes_clients=False, reads_openly=False)
-    try:
+    with closing(RunningGateway(network, follows=False, takes_clients=False, reads_openly=False)) as running:
         assert fetch(running, "/")[0] == 200
         assert fetch(running, "/play")[0] == 403
         for path, reason in (("actor", b"this gateway serves its page only"), ("raw", b"")):
@@ -280,8 +279,6 @@ def test_gateway_of_a_page_takes_no_clients(network: MemoryNetwork) -> None:
             viewer = Viewer(socket)
             viewer.send(type="hello", token="")
             assert "start it with --operator-token FILE" in viewer.receive("error")["reason"]
-    finally:
-        running.close()
 
 
 @pytest.mark.parametrize("path", ["actor", "watch"])

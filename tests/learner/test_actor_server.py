@@ -12,9 +12,9 @@ from log_lines import LINES
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving import held_answers, session_watchdog
+from daedalus.learner.serving import rollout_intake, session_watchdog
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.orders import Orders
+from daedalus.learner.serving.query_responses import Orders
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -76,7 +76,7 @@ def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken
     network: MemoryNetwork, algorithm: str, updates: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Actors may play the snapshot of that version before the next batch is complete."""
-    monkeypatch.setattr(held_answers, "_MOST_SECONDS", 1e6)  # only the next batch releases an answer
+    monkeypatch.setattr(rollout_intake, "_MOST_SECONDS", 1e6)  # only the next batch releases an answer
     counters = RunCounters(10)
     spec = run_spec(actors=1, algorithm=algorithm, passes=2, minibatches=3)
     server = open_server(network, spec, counters)

@@ -15,7 +15,7 @@ from log_lines import LINES
 from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, load_newest, save_checkpoint
 from daedalus.policy.saving import sealed
 from daedalus.policy.saving.regular_files import read_regular
-from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkpoints, find_policy, read_policy
+from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, UnreadableError, write_sealed
 
 SPEC = run_spec(algorithm="a3c", learning_rate=0.003, target_return=1.5)
@@ -73,12 +73,6 @@ def test_loaded_checkpoint_equals_the_saved_one(tmp_path: Path) -> None:
     for name, value in state(7).items():
         assert torch.equal(loaded.state[name], value)
         assert loaded.state[name].dtype == value.dtype
-
-
-def test_load_newest_returns_the_highest_version(tmp_path: Path) -> None:
-    for version in (9, 10, 2):
-        save(tmp_path, version)
-    assert load_newest(tmp_path).policy.policy_version == 10
 
 
 def test_load_newest_names_a_damaged_checkpoint_and_returns_the_previous_one(tmp_path: Path) -> None:
@@ -193,13 +187,10 @@ def test_checkpoint_with_counters_that_are_none_is_damaged(tmp_path: Path, count
 FILES = ["learner.safetensors", "manifest.json", "parameters.safetensors", "program.onnx", "seal"]
 
 
-def test_files_of_a_checkpoint(tmp_path: Path) -> None:
-    assert sorted(entry.name for entry in save(tmp_path, 1).iterdir()) == FILES
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_damage_to_any_file_is_detected(name: str, tmp_path: Path) -> None:
     path = save(tmp_path, 1) / name
+    assert sorted(entry.name for entry in path.parent.iterdir()) == FILES
     whole = path.read_bytes()
     places = {0, 8, len(whole) // 3, len(whole) // 2, len(whole) - 1}
     damaged = [whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :] for place in places]
@@ -215,16 +206,15 @@ def test_damage_to_any_file_is_detected(name: str, tmp_path: Path) -> None:
     load_checkpoint(path.parent)
 
 
-def test_policy_is_readable_when_the_optimiser_state_is_damaged(tmp_path: Path) -> None:
-    directory = save(tmp_path, 1)
-    flip(directory / "learner.safetensors", 20)
-    assert read_policy(directory).policy_version == 1
-
-
-def test_older_checkpoints_are_pruned(tmp_path: Path) -> None:
-    for version in range(1, 6):
-        save(tmp_path, version, keep=2)
-    assert names(tmp_path) == ["0000000004", "0000000005"]
+def test_older_checkpoints_are_pruned_and_the_highest_version_is_the_newest(tmp_path: Path) -> None:
+    for version in (1, 2, 9, 10, 4):
+        save(tmp_path, version, keep=3)
+    assert names(tmp_path) == ["0000000004", "0000000009", "0000000010"]
+    (tmp_path / "checkpoints" / ".0000000011.123.partial").mkdir()  # unfinished
+    assert [each.name for each in checkpoints(tmp_path)] == ["0000000010", "0000000009", "0000000004"]
+    save(tmp_path, 10, counters={**COUNTERS, "env_steps": 99})  # the same version may be saved again
+    newest = load_newest(tmp_path)
+    assert (newest.policy.policy_version, newest.counters["env_steps"]) == (10, 99)
 
 
 def test_only_checkpoints_of_ours_are_removed(tmp_path: Path) -> None:
@@ -246,19 +236,6 @@ def test_saved_checkpoint_is_kept_when_a_damaged_one_has_a_higher_version(tmp_pa
     saved = save(tmp_path, 11, keep=1)  # by a learner that resumed from version 10
     assert saved.is_dir()
     assert load_newest(tmp_path).policy.policy_version == 11
-
-
-def test_same_version_can_be_saved_again(tmp_path: Path) -> None:
-    save(tmp_path, 1)
-    save(tmp_path, 1, counters={**COUNTERS, "env_steps": 99})
-    assert names(tmp_path) == ["0000000001"]
-    assert load_newest(tmp_path).counters["env_steps"] == 99
-
-
-def test_unfinished_directory_is_not_listed_as_a_checkpoint(tmp_path: Path) -> None:
-    save(tmp_path, 1)
-    (tmp_path / "checkpoints" / ".0000000002.123.partial").mkdir()
-    assert [directory.name for directory in checkpoints(tmp_path)] == ["0000000001"]
 
 
 @pytest.mark.parametrize("version", [1, 2])

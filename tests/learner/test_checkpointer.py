@@ -17,10 +17,10 @@ from log_lines import LINES
 from daedalus.learner.run import health, run_directory
 from daedalus.learner.run.candidates import candidates
 from daedalus.learner.run.counters import check_counters
-from daedalus.learner.run.descriptors import reserve_descriptors
-from daedalus.learner.run.evaluations import Evaluated
 from daedalus.learner.run.heartbeat import HEARTBEAT, Heartbeat
+from daedalus.learner.run.process_resources import reserve_descriptors
 from daedalus.learner.run.run_state import RunState
+from daedalus.learner.serving.evaluations import Evaluated
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training import checkpointer as module
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest

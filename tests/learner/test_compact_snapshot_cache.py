@@ -1,10 +1,10 @@
-"""learner/serving/compact_snapshot_cache.py: compact snapshots for actors that request them."""
+"""learner/serving/snapshot_publisher.py: compact snapshots for actors that request them."""
 
 import numpy as np
 import pytest
 
-from daedalus.learner.serving import compact_snapshot_cache as compact_cache
-from daedalus.learner.serving.compact_snapshot_cache import PART_BYTES, CompactSnapshotCache
+from daedalus.learner.serving import snapshot_publisher as compact_cache
+from daedalus.learner.serving.snapshot_publisher import PART_BYTES, CompactSnapshotCache
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import bfloat16, bits_of, float32
 from daedalus.protocol.limits import Limits

@@ -1,4 +1,4 @@
-"""learner/serving/components.py: what a rollout of several components may contain."""
+"""learner/serving/upload_checks.py: what a rollout of several components may contain."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""learner/serving/evaluation_server.py: how often a policy is saved and handed out, however many ask for it."""
+"""EvaluationServer of learner/training_loop.py: how often a policy is saved and handed out, however many ask for it."""
 
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,10 @@ import pytest
 from building import EPOCH, SPACES, run_spec
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.evaluations import Evaluated, Evaluations
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.evaluation_server import EvaluationServer
+from daedalus.learner.serving.evaluations import Evaluated, Evaluations
 from daedalus.learner.training.checkpointer import Saving
+from daedalus.learner.training_loop import EvaluationServer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits

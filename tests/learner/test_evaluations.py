@@ -1,4 +1,4 @@
-"""learner/run/evaluations.py: checkpoints are kept during their evaluation, the best permanently."""
+"""learner/serving/evaluations.py: checkpoints are kept during their evaluation, the best permanently."""
 
 import errno
 import os
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from building import EPOCH, SPACES, run_spec
 
-from daedalus.learner.reporting.metrics import COLUMNS
+from daedalus.learner.reporting.metrics_rows import COLUMNS
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.evaluations import Evaluations
+from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, load_newest, save_checkpoint
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
@@ -88,33 +88,27 @@ def test_first_evaluated_checkpoint_is_kept_as_best_under_its_score(run: Run) ->
     assert load_checkpoint(best).policy.weights["w"].tolist() == [7.0] * 3
 
 
-def test_best_checkpoint_changes_only_with_a_higher_score(run: Run) -> None:
-    texts = [run.play(version, score) for version, score in ((1, 5.0), (2, 4.0), (3, 9.0), (4, -1.0))]
+def test_best_checkpoint_changes_only_with_a_higher_score_which_is_counted(run: Run) -> None:
+    assert run.evaluations.counters.best_evaluation is None
+    texts, counted = [], []
+    for version, score in ((1, -5.0), (2, -20.5), (3, 9.0), (4, -1.0)):
+        texts.append(run.play(version, score))
+        counted.append(run.evaluations.counters.best_evaluation)
     assert [text.endswith("the best so far") for text in texts] == [True, False, True, False]
-    assert [best_score(each) for each in best_checkpoints(run.directory)] == [9.0, 5.0, 4.0]
+    assert counted == [-5.0, -5.0, 9.0, 9.0]
+    assert [best_score(each) for each in best_checkpoints(run.directory)] == [9.0, -1.0, -5.0]
     assert best_checkpoints(run.directory)[0].name == "best_9.0_0000000003"
 
 
-def test_negative_scores_are_compared_as_numbers(run: Run) -> None:
-    for version, score in ((1, -20.5), (2, -3.0), (3, -10.0)):
-        run.play(version, score)
-    assert run.names[-1] == "best_-3.0_0000000002"
-
-
-def test_best_checkpoint_is_kept_after_its_numbered_checkpoint_is_pruned(run: Run) -> None:
+def test_best_checkpoint_is_kept_after_its_numbered_checkpoint_is_pruned_and_is_not_the_newest(run: Run) -> None:
     run.play(1, 5.0)
     for version in (2, 3, 4):
         run.save(version)
     assert run.names == ["0000000003", "0000000004", "best_5.0_0000000001"]
     best = best_checkpoints(run.directory)[0]
     assert load_checkpoint(best).policy.weights["w"].tolist() == [1.0] * 3
-
-
-def test_load_newest_ignores_best_checkpoints(run: Run) -> None:
-    run.play(1, 5.0)
-    run.save(2)
-    assert [path.name for path in checkpoints(run.directory)] == ["0000000002", "0000000001"]
-    assert load_newest(run.directory).policy.policy_version == 2
+    assert [path.name for path in checkpoints(run.directory)] == ["0000000004", "0000000003"]
+    assert load_newest(run.directory).policy.policy_version == 4
 
 
 def test_resumed_run_compares_with_the_best_of_the_previous_process(run: Run) -> None:
@@ -201,52 +195,36 @@ def test_new_request_of_an_evaluator_replaces_its_previous_evaluation(run: Run) 
 # ---------------------------------------------------------------------------------------- rejected reports
 
 
-def assert_not_accepted(run: Run, answer: Acknowledgement, text: str, verdict: str, reason: str) -> None:
-    assert answer.verdict == verdict
+def report(
+    version: int = 1, epoch: int = EPOCH, returns: tuple[float, ...] = (9.0,), length: int = 1
+) -> EvaluationReport:
+    played = np.array(returns, np.float32)
+    lengths = np.full(len(played), length, np.int32)
+    return EvaluationReport(evaluator="e", learner_epoch=epoch, policy_version=version, returns=played, lengths=lengths)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "verdict", "reason"),
+    [
+        (report(version=2), "rejected", "evaluator 'e' has no evaluation of policy version 2"),
+        (report(epoch=EPOCH + 1), "fenced", "another learner epoch"),
+        *((report(returns=(3.0, value)), "rejected", "not finite") for value in (np.nan, np.inf, -np.inf)),
+        (report(length=0), "rejected", "lengths has a value below 1"),
+    ],
+)
+def test_wrong_report_is_not_accepted_and_the_evaluation_stays_open_for_one_right_one(
+    run: Run, wrong: EvaluationReport, verdict: str, reason: str
+) -> None:
+    run.save(1)
+    assert run.send(report())[0].verdict == "rejected", "no evaluation is in progress"
+    run.begin(1)
+    answer, text = run.send(wrong)
+    assert (answer.verdict, text) == (verdict, "")
     assert reason in answer.reason
-    assert text == ""
     assert best_checkpoints(run.directory) == []
     assert run.evaluations.take_newest() == {}
-
-
-def test_report_without_an_evaluation_in_progress_is_rejected(run: Run) -> None:
-    run.save(1)
-    assert_not_accepted(run, *run.report(1, 9.0), "rejected", "evaluator 'e' has no evaluation of policy version 1")
-
-
-def test_report_of_a_wrong_version_is_rejected_and_the_evaluation_stays_open(run: Run) -> None:
-    run.begin(1)
-    assert_not_accepted(run, *run.report(2, 9.0), "rejected", "no evaluation of policy version 2")
-    assert run.report(1, 9.0)[0].verdict == "accepted"
-
-
-def test_second_report_of_an_evaluation_is_rejected(run: Run) -> None:
-    run.begin(1)
-    assert run.report(1, 3.0)[0].verdict == "accepted"
-    assert run.report(1, 9.0)[0].verdict == "rejected"
-    assert run.names[-1] == "best_3.0_0000000001"
-
-
-def test_report_for_another_learner_epoch_is_fenced(run: Run) -> None:
-    run.begin(1)
-    assert_not_accepted(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another learner epoch")
-    assert run.report(1, 9.0)[0].verdict == "accepted"
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_report_with_returns_that_are_not_finite_is_rejected(run: Run, value: float) -> None:
-    run.begin(1)
-    assert_not_accepted(run, *run.report(1, 3.0, value), "rejected", "not finite")
-    assert run.report(1, 3.0)[0].verdict == "accepted"
-
-
-def test_report_with_a_length_below_1_is_rejected(run: Run) -> None:
-    run.begin(1)
-    lengths = np.array([5, 0], np.int32)
-    report = EvaluationReport(
-        evaluator="e", learner_epoch=EPOCH, policy_version=1, returns=np.ones(2, np.float32), lengths=lengths
-    )
-    assert_not_accepted(run, *run.send(report), "rejected", "lengths has a value below 1")
+    assert [run.send(report())[0].verdict for _ in range(2)] == ["accepted", "rejected"]
+    assert run.names[-1] == "best_9.0_0000000001"
 
 
 # -------------------------------------------------------------------------------------------------- metrics
@@ -285,10 +263,3 @@ def test_evaluations_of_one_owner_do_not_displace_the_others(tmp_path: Path) -> 
     for number in range(100):
         evaluations.begin(f"greedy.{number}", tmp_path / str(number), number, 0)
     assert evaluations.checkpoints_in_use == {tmp_path / "honest", *(tmp_path / str(n) for n in range(85, 100))}
-
-
-def test_best_evaluation_is_counted(run: Run) -> None:
-    assert run.evaluations.counters.best_evaluation is None
-    for version, mean, best in ((1, 4.0, 4.0), (2, 6.0, 6.0), (3, 2.0, 6.0)):
-        run.play(version, mean, mean)
-        assert run.evaluations.counters.best_evaluation == best

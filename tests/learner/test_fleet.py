@@ -4,7 +4,7 @@ import pytest
 from building import SPACES, identity, joined_fleet
 
 from daedalus.learner.serving import fleet as fleet_module
-from daedalus.learner.serving import fleet_status, former_incarnations, presence
+from daedalus.learner.serving import query_responses
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import PAGE_ACTORS, Join, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
@@ -170,7 +170,7 @@ def test_forgotten_actors_leave_room_for_others_of_their_owner(monkeypatch: pyte
 
 
 def test_tokens_of_one_owner_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(presence, "_MAX_OF_ONE_OWNER", 2)
+    monkeypatch.setattr(fleet_module, "_MAX_TOKENS", 2)
     fleet = joined_fleet("arm", "arm.1", "arm.2", "box")
     assert fleet.live == {"arm", "arm.1", "box"}
     fleet.set_present("arm.2", 1, False, 0.0)
@@ -211,7 +211,7 @@ def test_presence_of_another_incarnation_does_not_make_an_actor_live() -> None:
     fleet.set_present("a", 2, True, 0.0)
     fleet.set_present("a", 1, False, 0.0)
     assert not fleet.live
-    assert [status.alive for status in fleet_status.page(fleet, "", 0.0)] == [False]
+    assert [status.alive for status in query_responses.page(fleet, "", 0.0)] == [False]
 
 
 def test_presence_without_join_does_not_create_an_actor() -> None:
@@ -225,11 +225,11 @@ def test_presence_without_join_does_not_create_an_actor() -> None:
 def test_missed_rollouts_are_counted_and_fit_the_wire_integer() -> None:
     fleet = joined_fleet("a")
     fleet.actors["a"].sequences.add(WINDOW + 4)
-    assert fleet_status.page(fleet, "", 0.0)[0].rollouts_missed == 5
+    assert query_responses.page(fleet, "", 0.0)[0].rollouts_missed == 5
     fleet.actors["a"].sequences.add(2**63 - 1)
     fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=1), 0.0)
     fleet.actors["a"].sequences.add(2**63 - 1)
-    assert fleet_status.page(fleet, "", 0.0)[0].rollouts_missed < 2**63
+    assert query_responses.page(fleet, "", 0.0)[0].rollouts_missed < 2**63
 
 
 def test_seeds_depend_on_actor_incarnation_start_version_and_run_seed() -> None:
@@ -260,7 +260,7 @@ def test_epsilon_is_drawn_by_seed_and_name_and_is_the_same_after_a_restart() -> 
     for incarnation in (1, 2):
         assert attempt(fleet, "actor-0", incarnation) is None
         assert fleet.actors["actor-0"].epsilon == drawn(1)[0]
-        assert fleet_status.page(fleet, "", 0.0)[0].epsilon == drawn(1)[0]
+        assert query_responses.page(fleet, "", 0.0)[0].epsilon == drawn(1)[0]
 
 
 def test_names_with_the_same_checksum_share_neither_seed_nor_epsilon() -> None:
@@ -276,7 +276,7 @@ def test_statuses_are_sorted_by_actor_name() -> None:
     fleet.actors["b"].rejected["stale"] += 2
     fleet.actors["b"].accepted = 5
     fleet.set_present("b", 1, False, 0.0)
-    first, second = fleet_status.page(fleet, "", 3.0)
+    first, second = query_responses.page(fleet, "", 3.0)
     assert (first.actor, first.alive, first.seconds_since_seen, first.environments) == ("a", True, 3.0, 3)
     assert (second.actor, second.alive, second.rollouts_accepted) == ("b", False, 5)
     assert second.rollouts_rejected == {"stale": 2}
@@ -303,12 +303,12 @@ def test_run_totals_do_not_fall_when_an_actor_is_forgotten() -> None:
         fleet.actors[name].sequences.add(WINDOW + 1)
     fleet.actors["b"].quarantined = "unfit"
     expected = {"rollouts_missed": 4, "busy_answers": 10, "actors_alive": 1, "actors_quarantined": 1, "actors_gone": 0}
-    assert fleet_status.totals(fleet) == expected
+    assert query_responses.totals(fleet) == expected
     fleet.set_present("a", 1, False, 1.0)
-    assert fleet_status.totals(fleet) == {**expected, "actors_alive": 0, "actors_gone": 1}
+    assert query_responses.totals(fleet) == {**expected, "actors_alive": 0, "actors_gone": 1}
     fleet.forget_absent(2.0 + MINUTE)
     missed = 4 + WINDOW - 1  # what was missing within the window is given up
-    assert fleet_status.totals(fleet) == {**expected, "actors_alive": 0, "rollouts_missed": missed}
+    assert query_responses.totals(fleet) == {**expected, "actors_alive": 0, "rollouts_missed": missed}
 
 
 def test_forgotten_incarnation_that_returns_continues_above_its_highest_sequence_number() -> None:
@@ -356,7 +356,7 @@ def test_quarantined_incarnation_is_not_accepted_after_it_was_forgotten() -> Non
 
 
 def test_number_of_remembered_incarnations_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(former_incarnations, "_MAX_FORMER", 10)
+    monkeypatch.setattr(fleet_module, "_MAX_FORMER", 10)
     fleet = Fleet(1, None)
     for incarnation in range(100):
         assert attempt(fleet, "a", incarnation) is None
@@ -369,7 +369,7 @@ def test_number_of_remembered_incarnations_is_bounded(monkeypatch: pytest.Monkey
 def test_pages_of_the_status_contain_every_actor_once() -> None:
     fleet = joined_fleet(*(f"a{number}" for number in range(2 * PAGE_ACTORS + 50)))
     pages, after = [], ""
-    while page := fleet_status.page(fleet, after, 0.0):
+    while page := query_responses.page(fleet, after, 0.0):
         pages.append([status.actor for status in page])
         after = page[-1].actor
     assert [len(each) for each in pages] == [PAGE_ACTORS, PAGE_ACTORS, 50]

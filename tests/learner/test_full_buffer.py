@@ -9,7 +9,7 @@ from building import EPOCH, identity, joined_fleet, make_rollout, run_spec
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving import held_answers, request_queue, rollout_intake
+from daedalus.learner.serving import rollout_intake
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.protocol.codec import decode, encode
@@ -86,7 +86,7 @@ def intake() -> Iterator[Intake]:
 def test_no_answer_is_late_while_the_learner_computes_a_long_batch(
     intake: Intake, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(held_answers, "_MOST_SECONDS", 0.3)
+    monkeypatch.setattr(rollout_intake, "_MOST_SECONDS", 0.3)
     monkeypatch.setattr(rollout_intake, "LATE_SECONDS", 0.3)
     intake.offer(0, 1)
     assert intake.answers(2) == [(0, "accepted"), (1, "accepted")]
@@ -110,13 +110,3 @@ def test_rollouts_that_wait_for_room_keep_their_order_and_their_senders_wait(int
     assert intake.rollouts.take_batch(0) == []
     assert intake.answers(1) == [(4, "accepted")]
     assert intake.counters.rollouts_accepted == 5
-
-
-def test_requests_that_are_not_judged_in_time_are_answered_busy(
-    intake: Intake, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(request_queue, "LATE_SECONDS", 0.3)
-    intake.offer(0, 1, 2, 3, 4)
-    assert intake.answers(4) == [(0, "accepted"), (1, "accepted"), (3, "busy"), (4, "busy")]
-    assert intake.batch() == [0, 1]
-    until(lambda: intake.counters.rollouts_accepted == 3)

@@ -20,9 +20,8 @@ from building import (
 )
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.actor_state import NON_FINITE
 from daedalus.learner.serving.events import EventLog
-from daedalus.learner.serving.fleet import Actor
+from daedalus.learner.serving.fleet import NON_FINITE, Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.spec import PolicySpec, TrainingSpec

@@ -9,9 +9,8 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.components import first_component_violation
-from daedalus.learner.serving.gradient_checks import restored
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
+from daedalus.learner.serving.upload_checks import first_component_violation, restored
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Message

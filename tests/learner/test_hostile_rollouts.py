@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain import plain
 
-from daedalus.learner.reporting.report import episode_statistics
+from daedalus.learner.reporting.run_reporter import episode_statistics
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.learner.training.learner import Learner

@@ -15,8 +15,8 @@ from torch.testing import assert_close
 
 from daedalus.algorithms.gradients import Terms
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, save_checkpoint
-from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS, UpdateMetrics
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -24,7 +24,7 @@ from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout
 
-STEPS = 5
+STEPS = 3
 NORMALIZED = PolicySpec(hidden=(8,), normalize_observations=True)
 
 
@@ -220,24 +220,21 @@ def test_memory_with_one_environment_makes_one_version_and_one_optimiser_step_fo
 # ------------------------------------------------------------------------------------- rates and metrics
 
 
-def test_rates_are_annealed_over_the_budget_and_constant_outside() -> None:
-    learner = make_learner(
-        learning_rate=0.4, learning_rate_final=0.2, entropy_bonus=0.0, entropy_bonus_final=1.0, algorithm="a2c"
-    )
-    shares = (-1.0, 0.0, 0.25, 0.5, 1.0, 1.5)
-    assert [learner.learning_rate(share) for share in shares] == pytest.approx([0.4, 0.4, 0.35, 0.3, 0.2, 0.2])
-    assert [learner.entropy_bonus(share) for share in shares] == pytest.approx([0.0, 0.0, 0.25, 0.5, 1.0, 1.0])
-
-
-def test_rates_without_final_value_are_constant() -> None:
-    learner = make_learner(learning_rate=0.4, entropy_bonus=0.3)
-    assert [learner.learning_rate(share) for share in (0.0, 0.7, 1.0)] == [0.4] * 3
-    assert [learner.entropy_bonus(share) for share in (0.0, 0.7, 1.0)] == [0.3] * 3
-
-
-def test_final_rate_of_0_is_used() -> None:
-    learner = make_learner(learning_rate_final=0.0, entropy_bonus_final=0.0)
-    assert (learner.learning_rate(1.0), learner.entropy_bonus(1.0)) == (0.0, 0.0)
+@pytest.mark.parametrize(
+    ("settings", "rates", "bonuses"),
+    [
+        ({"learning_rate_final": 0.2, "entropy_bonus_final": 1.0}, [0.4, 0.4, 0.35, 0.2, 0.2], [0, 0, 0.25, 1, 1]),
+        ({}, [0.4] * 5, [0.0] * 5),
+        ({"learning_rate_final": 0.0, "entropy_bonus_final": 0.0}, [0.4, 0.4, 0.3, 0.0, 0.0], [0.0] * 5),
+    ],
+)
+def test_rates_are_annealed_over_the_budget_and_constant_outside(
+    settings: dict[str, float], rates: list[float], bonuses: list[float]
+) -> None:
+    learner = make_learner(**{"learning_rate": 0.4, "entropy_bonus": 0.0, "algorithm": "a2c", **settings})
+    shares = (-1.0, 0.0, 0.25, 1.0, 1.5)
+    assert [learner.learning_rate(share) for share in shares] == pytest.approx(rates)
+    assert [learner.entropy_bonus(share) for share in shares] == pytest.approx(bonuses)
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])

@@ -24,15 +24,14 @@ from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.service import ActorService
 from daedalus.analysis.recorded_run import read_metrics
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.event_file import read_events
-from daedalus.learner.run.finished import finished_run
+from daedalus.learner.run.resuming import CheckpointMismatchError, finished_run
 from daedalus.learner.run.run_directory import read_json, write_json
 from daedalus.learner.service import LearnerService
+from daedalus.learner.serving.events import read_events
 from daedalus.learner.training.checkpoint import Checkpoint, load_newest
-from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score, keep_if_best
 from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, read_policy
@@ -288,7 +287,7 @@ class HangingCollector(EnvironmentCollector):
 def test_actor_whose_environment_hangs_does_not_hold_the_updates_of_a2c(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daedalus.learner.serving.stragglers._PATIENCE_SECONDS", 0.5)
+    monkeypatch.setattr("daedalus.learner.serving.rollout_buffer._PATIENCE_SECONDS", 0.5)
     training_run = TrainingRun(
         tmp_path,
         environment={"id": "CartPole-v1"},

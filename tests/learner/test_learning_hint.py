@@ -1,8 +1,8 @@
-"""learner/reporting/learning_hint.py: a run that does not learn says so, once."""
+"""learner/reporting/learning_hints.py: a run that does not learn says so, once."""
 
 import pytest
 
-from daedalus.learner.reporting.learning_hint import LearningHint
+from daedalus.learner.reporting.learning_hints import LearningHint
 
 
 def row(

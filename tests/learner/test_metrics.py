@@ -12,8 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from daedalus.learner.reporting.csv_writer import CsvWriter, cut_rows
-from daedalus.learner.reporting.metrics import COLUMNS, Details, tag
-from daedalus.learner.reporting.metrics_file import read_rows
+from daedalus.learner.reporting.metrics_rows import COLUMNS, Details, read_rows, tag
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.training.update_metrics import METRICS
 
@@ -23,6 +22,21 @@ NONE = Details()
 def read(path: Path) -> list[dict[str, str]]:
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
+
+
+def write(path: Path, *rows: dict[str, float]) -> None:
+    """Write rows by a new writer of the CSV file."""
+    with closing(CsvWriter(path)) as writer:
+        for row in rows:
+            writer.write(row, NONE)
+
+
+def events_of(folder: Path, *rows: tuple[dict[str, float], Details]) -> EventAccumulator:
+    """Return what TensorBoard reads after these rows."""
+    with closing(TensorBoardWriter(folder)) as writer:
+        for row, details in rows:
+            writer.write(row, details)
+    return EventAccumulator(str(folder)).Reload()
 
 
 def test_csv_has_a_header_and_a_line_for_each_row_with_blank_unknown_values(tmp_path: Path) -> None:
@@ -39,10 +53,9 @@ def test_csv_has_a_header_and_a_line_for_each_row_with_blank_unknown_values(tmp_
     "value", [1_000_001.0, 1234567.0, 16_777_217.0, 1e9 + 1, 2e-5 / 3, 1e-9, -0.1, 1e22, np.float64(1 / 3), 2**53 - 1]
 )
 def test_numbers_are_exact_in_the_csv(tmp_path: Path, value: float) -> None:
-    with closing(CsvWriter(tmp_path / "metrics.csv")) as writer:
-        writer.write({"env_steps": 2**33 + 1, "user/score": value, "episode_return_mean": value}, NONE)
-    (row,) = read_rows(tmp_path / "metrics.csv")
-    assert row == {"env_steps": 2**33 + 1, "user/score": value, "episode_return_mean": value}
+    row = {"env_steps": 2**33 + 1, "user/score": value, "episode_return_mean": value}
+    write(tmp_path / "metrics.csv", row)
+    assert list(read_rows(tmp_path / "metrics.csv")) == [row]
 
 
 def test_rows_after_the_checkpoint_are_cut_and_those_that_an_earlier_release_left(tmp_path: Path) -> None:
@@ -70,23 +83,15 @@ def test_tensorboard_forgets_what_a_resumed_run_has_undone(tmp_path: Path) -> No
     ]
 
 
-def test_csv_continues_after_a_resume_without_a_second_header(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.csv"
-    for env_steps in (1, 2):
-        writer = CsvWriter(path)
-        writer.write({"env_steps": env_steps}, NONE)
-        writer.close()
-    assert [row["env_steps"] for row in read(path)] == ["1", "2"]
-
-
 def test_csv_continues_with_the_columns_of_an_existing_header_and_adds_new_ones(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     path.write_text("wall_seconds,policy_loss,env_steps,no_longer_measured\r\n0.5,0.25,10,7\r\n")
-    writer = CsvWriter(path)
-    writer.write({"env_steps": 15, "policy_loss": 0.5}, NONE)
-    writer.write({"env_steps": 20, "clipped_fraction": 0.1, "policy_loss": -1.5, "wall_seconds": 1.5}, NONE)
-    writer.write({"env_steps": 30, "env/laps": 2.0}, NONE)
-    writer.close()
+    write(
+        path,
+        {"env_steps": 15, "policy_loss": 0.5},
+        {"env_steps": 20, "clipped_fraction": 0.1, "policy_loss": -1.5, "wall_seconds": 1.5},
+        {"env_steps": 30, "env/laps": 2.0},
+    )
     names = ("wall_seconds", "policy_loss", "env_steps", "no_longer_measured", "clipped_fraction", "env/laps")
     assert read(path) == [
         dict(zip(names, ("0.5", "0.25", "10", "7", "", ""), strict=True)),
@@ -116,9 +121,7 @@ def test_csv_that_cannot_be_written_anew_keeps_its_rows(tmp_path: Path, monkeypa
 def test_csv_continues_a_file_whose_header_is_damaged(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     path.write_bytes(b"wall_seconds,env_\xffsteps\r\n1,2\r\n")
-    writer = CsvWriter(path)
-    writer.write({"wall_seconds": 2.0, "env_steps": 5}, NONE)
-    writer.close()
+    write(path, {"wall_seconds": 2.0, "env_steps": 5})
     assert read(path) == [
         {"wall_seconds": "1", "env_\ufffdsteps": "2", "env_steps": ""},
         {"wall_seconds": "2", "env_\ufffdsteps": "", "env_steps": "5"},
@@ -130,44 +133,31 @@ def test_csv_without_rows_raises_os_error_that_says_what_to_do(tmp_path: Path, h
     """The recorder then logs it, and training continues."""
     path = tmp_path / "metrics.csv"
     path.write_bytes(header + b'"' + b"x" * 200_000 + b"\n")
-    with (
-        pytest.raises(OSError, match=r"metrics\.csv is damaged \(field larger .*\): move it away"),
-        closing(CsvWriter(path)) as writer,
-    ):
-        writer.write({"env_steps": 1, "env/laps": 2.0}, NONE)
+    with pytest.raises(OSError, match=r"metrics\.csv is damaged \(field larger .*\): move it away"):
+        write(path, {"env_steps": 1, "env/laps": 2.0})
+    with pytest.raises(OSError, match="Is a directory"):
+        CsvWriter(tmp_path)
 
 
-@pytest.mark.parametrize("partial", [b"3", b"3,4", b"3,4\r", b"7" * 150_000])
+@pytest.mark.parametrize("partial", [b"", b"3", b"3,4", b"3,4\r", b"7" * 150_000])
 def test_csv_continues_after_the_part_of_a_line_that_a_crash_left(tmp_path: Path, partial: bytes) -> None:
     path = tmp_path / "metrics.csv"
     path.write_bytes(b"wall_seconds,env_steps\r\n1,2\r\n" + partial)
-    writer = CsvWriter(path)
-    writer.write({"wall_seconds": 5.0, "env_steps": 6}, NONE)
-    writer.close()
+    write(path, {"wall_seconds": 5.0, "env_steps": 6})
     assert path.read_bytes() == b"wall_seconds,env_steps\r\n1,2\r\n5,6\r\n"
 
 
-def test_csv_writes_its_header_anew_after_a_part_of_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("part", [b"", b"wall_sec"])
+def test_csv_writes_its_header_anew_after_a_part_of_it(tmp_path: Path, part: bytes) -> None:
     path = tmp_path / "metrics.csv"
-    path.write_bytes(b"wall_sec")
-    CsvWriter(path).close()
-    assert path.read_text().strip() == ",".join(COLUMNS)
-
-
-def test_csv_writes_a_header_to_an_empty_file(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.csv"
-    path.touch()
-    CsvWriter(path).close()
+    path.write_bytes(part)
+    write(path)
     assert path.read_text().strip() == ",".join(COLUMNS)
 
 
 def test_tensorboard_scalars_are_against_env_steps(tmp_path: Path) -> None:
-    writer = TensorBoardWriter(tmp_path)
-    writer.write({"env_steps": 100, "policy_loss": 0.5, "updates": 3}, NONE)
-    writer.write({"env_steps": 250, "policy_loss": -1.5}, NONE)
-    writer.close()
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
+    rows = {"env_steps": 100, "policy_loss": 0.5, "updates": 3}, {"env_steps": 250, "policy_loss": -1.5}
+    events = events_of(tmp_path, *((row, NONE) for row in rows))
     assert sorted(events.Tags()["scalars"]) == ["time/updates", "train/policy_loss"]
     assert [(scalar.step, scalar.value) for scalar in events.Scalars("train/policy_loss")] == [(100, 0.5), (250, -1.5)]
     assert [(scalar.step, scalar.value) for scalar in events.Scalars("time/updates")] == [(100, 3.0)]
@@ -190,18 +180,15 @@ def test_every_tag_is_in_a_group() -> None:
     assert tag("rollouts_accepted") == "rollout/rollouts_accepted"
     assert tag("env/laps") == "env/laps"
     assert {name: tag(name).count("/") for name in COLUMNS} == dict.fromkeys(COLUMNS, 1)
-    assert len({tag(name) for name in COLUMNS}) == len(COLUMNS)
+    assert len({tag(name) for name in COLUMNS}) == len(set(COLUMNS)) == len(COLUMNS)
+    assert set(METRICS) <= set(COLUMNS)
 
 
 def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Path) -> None:
     picture = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
     details = Details(returns=[1.0, 1.0, 5.0], lengths=[3, 4, 4], action_counts={"action": [2, 0, 5]}, picture=picture)
-    writer = TensorBoardWriter(tmp_path)
-    writer.write({"env_steps": 100}, details)
-    writer.write({"env_steps": 200}, Details(action_counts={"action": [0, 0, 0]}))  # no new values
-    writer.close()
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
+    no_new_values = Details(action_counts={"action": [0, 0, 0]})
+    events = events_of(tmp_path, ({"env_steps": 100}, details), ({"env_steps": 200}, no_new_values))
     assert sorted(events.Tags()["histograms"]) == [
         "rollout/action",
         "rollout/episode_length",
@@ -233,11 +220,7 @@ LARGEST = float(np.finfo(np.float32).max)  # returns are float32 on the wire
     ],
 )
 def test_tensorboard_has_a_histogram_of_equal_and_of_very_large_returns(tmp_path: Path, returns: list[float]) -> None:
-    writer = TensorBoardWriter(tmp_path)
-    writer.write({"env_steps": 1}, Details(returns=returns, lengths=[1, 1]))
-    writer.close()
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
+    events = events_of(tmp_path, ({"env_steps": 1}, Details(returns=returns, lengths=[1, 1])))
     (found,) = events.Histograms("rollout/episode_return")
     histogram = found.histogram_value
     assert (histogram.min, histogram.max, sum(histogram.bucket)) == (min(returns), max(returns), 2.0)
@@ -247,11 +230,7 @@ def test_tensorboard_has_a_histogram_of_equal_and_of_very_large_returns(tmp_path
 
 def test_neighbouring_choices_share_a_bucket_where_there_are_many(tmp_path: Path) -> None:
     choices = 4672  # of chess: 19 in a bucket
-    writer = TensorBoardWriter(tmp_path)
-    writer.write({"env_steps": 1}, Details(action_counts={"action": [1] * (choices - 1) + [5]}))
-    writer.close()
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
+    events = events_of(tmp_path, ({"env_steps": 1}, Details(action_counts={"action": [1] * (choices - 1) + [5]})))
     (found,) = events.Histograms("rollout/action")
     buckets, limits = found.histogram_value.bucket, found.histogram_value.bucket_limit
     assert (buckets[:-1], buckets[-1]) == ([19.0] * 245, 17.0 + 4.0)
@@ -268,13 +247,3 @@ def test_histogram_of_actions_takes_no_memory_for_each_action(tmp_path: Path) ->
         tracemalloc.stop()
         writer.close()
     assert peak < 1 << 20
-
-
-def test_update_metrics_are_metrics_columns() -> None:
-    assert set(METRICS) <= set(COLUMNS)
-    assert len(set(COLUMNS)) == len(COLUMNS)
-
-
-def test_csv_raises_os_error_when_the_file_cannot_be_opened(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="Is a directory"):
-        CsvWriter(tmp_path)

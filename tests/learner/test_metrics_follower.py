@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from daedalus.learner.reporting.csv_writer import CsvWriter, cut_rows
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.trackers.metrics_follower import MetricsFollower
 
 

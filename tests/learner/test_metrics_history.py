@@ -1,15 +1,13 @@
-"""learner/serving/metrics_history.py and metrics_file.py: the metrics of a run, bounded, and read from its file."""
+"""learner/reporting/metrics_rows.py and metrics_file.py: the metrics of a run, bounded, and read from its file."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from daedalus.learner.reporting import metrics_rows
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
-from daedalus.learner.reporting.metrics_file import read_rows
-from daedalus.learner.serving import metrics_history
-from daedalus.learner.serving.metrics_history import MetricsHistory
+from daedalus.learner.reporting.metrics_rows import Details, MetricsHistory, read_rows
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import METRICS_LIMITS
 from daedalus.protocol.messages import MAX_PAGE_VALUES, MetricsReport
@@ -44,7 +42,7 @@ def test_rows_have_a_value_for_each_column_that_any_of_them_has() -> None:
 
 
 def test_a_long_run_is_thinned_over_its_whole_length_and_keeps_the_newest_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_history, "MAX_ROWS", 8)
+    monkeypatch.setattr(metrics_rows, "MAX_ROWS", 8)
     history, steps = MetricsHistory(), list[float]()
     for step in range(1000):
         history.add({"env_steps": step})
@@ -56,7 +54,7 @@ def test_a_long_run_is_thinned_over_its_whole_length_and_keeps_the_newest_row(mo
 
 
 def test_an_evaluation_survives_the_row_that_it_came_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_history, "MAX_ROWS", 4)
+    monkeypatch.setattr(metrics_rows, "MAX_ROWS", 4)
     history = MetricsHistory()
     for step in range(33):
         evaluation = {"evaluation_return_mean": float(step), "evaluation_env_steps": step} if step % 16 == 3 else {}

@@ -22,7 +22,7 @@ from daedalus.algorithms.normalization import (
 )
 from daedalus.algorithms.running_returns import RunningReturns
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
@@ -368,7 +368,7 @@ def test_honest_numbers_count_in_full(values: Callable[[Votes, str, int], np.nda
     np.testing.assert_allclose(votes.moments.mean, np.concatenate(votes.honest).mean(0), rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("actors", ["a", "ab", "abcdefgh"])
+@pytest.mark.parametrize("actors", ["a", "abcdefgh"])
 @pytest.mark.parametrize(("before", "after"), [(0.0, 1.0), (0.0, 1000.0), (1.0, 1000.0), (1.0, 1e5), (1e-3, 1.0)])
 def test_numbers_that_jump_are_followed(actors: str, before: float, after: float) -> None:
     """As when the goal is found for the first time, or a sensor that was constant is used."""

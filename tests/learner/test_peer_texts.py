@@ -8,8 +8,7 @@ from building import ENVIRONMENTS, EPOCH, SPACES, identity, joined_fleet, make_r
 
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.fleet_status import page, totals
-from daedalus.learner.serving.query_responses import QueryResponses
+from daedalus.learner.serving.query_responses import QueryResponses, page, totals
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, Limits

@@ -31,6 +31,12 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> Screen:
+    monkeypatch.setenv("COLUMNS", "200")
+    return Screen()
+
+
 def row(env_steps: int, **known: float) -> dict[str, float]:
     return {
         "wall_seconds": 2.0,
@@ -43,8 +49,7 @@ def row(env_steps: int, **known: float) -> dict[str, float]:
     }
 
 
-def test_line_is_rewritten_on_a_terminal() -> None:
-    screen = Screen()
+def test_line_is_rewritten_on_a_terminal(screen: Screen) -> None:
     progress = Progress(screen, 1000)
     progress.show(row(100))
     progress.show(row(200))
@@ -54,8 +59,7 @@ def test_line_is_rewritten_on_a_terminal() -> None:
     assert "\n" not in screen.getvalue()
 
 
-def test_said_text_is_a_permanent_line_of_its_own() -> None:
-    screen = Screen()
+def test_said_text_is_a_permanent_line_of_its_own(screen: Screen) -> None:
     progress = Progress(screen, 1000)
     progress.say("one")
     progress.show(row(100))
@@ -67,8 +71,7 @@ def test_said_text_is_a_permanent_line_of_its_own() -> None:
     assert lines[2:] == ["two", "three", ""]
 
 
-def test_end_terminates_the_rewritten_line_once() -> None:
-    screen = Screen()
+def test_end_terminates_the_rewritten_line_once(screen: Screen) -> None:
     progress = Progress(screen, 1000)
     progress.show(row(100))
     progress.end()
@@ -94,9 +97,7 @@ def test_log_gets_a_record_after_1_second_and_then_every_5_seconds_without_a_ter
     assert stream.getvalue() == "done\n"
 
 
-def test_line_shows_the_return_after_the_first_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    screen = Screen()
+def test_line_shows_the_return_after_the_first_episode(screen: Screen) -> None:
     progress = Progress(screen, 2_000_000)
     progress.show(row(1_500_000))
     assert "return       -" in screen.getvalue()
@@ -107,25 +108,20 @@ def test_line_shows_the_return_after_the_first_episode(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(("mean", "shown"), [(0.00012, "0.00012"), (-0.034, "-0.034"), (12_345_678.9, "12,345,679")])
-def test_line_shows_returns_of_any_size(mean: float, shown: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    screen = Screen()
+def test_line_shows_returns_of_any_size(mean: float, shown: str, screen: Screen) -> None:
     Progress(screen, 2_000_000).show(row(1_500_000, episode_return_mean=mean))
     assert f"return {shown:>7}  " in screen.getvalue()
 
 
-def test_rates_are_unknown_before_the_first_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    screen = Screen()
+def test_rates_are_unknown_before_the_first_batch(screen: Screen) -> None:
     Progress(screen, 1000).show({"wall_seconds": 2.0, "env_steps": 0, "actors": 2})
     for part in ("       -/s  left      -  updates     -/s", "lag -  actors 2"):
         assert part in screen.getvalue()
 
 
 @pytest.mark.parametrize("columns", [20, 60, 80, 100, 200])
-def test_line_fits_the_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_line_fits_the_terminal(columns: int, screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
-    screen = Screen()
     Progress(screen, 2_000_000).show(row(1_500_000, episode_return_mean=-1234.5, episode_length_mean=1000.0))
     line = screen.getvalue().removeprefix(CLEAR)
     assert len(line) < columns
@@ -133,10 +129,8 @@ def test_line_fits_the_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -
         assert (part in line) == (columns >= needed), part
 
 
-def test_rate_and_time_left_are_measured_over_the_rows_of_30_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rate_and_time_left_are_measured_over_the_rows_of_30_seconds(screen: Screen) -> None:
     """A slow environment makes 16 steps every 4 seconds, and most rows have none."""
-    monkeypatch.setenv("COLUMNS", "200")
-    screen = Screen()
     progress = Progress(screen, 10_000)
     for second in range(0, 120):
         progress.show(row(16 * (second // 4), wall_seconds=float(second), env_steps_per_second=0.0))

@@ -9,8 +9,7 @@ from plain import vector_spaces
 
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.fleet_status import page
-from daedalus.learner.serving.query_responses import QueryResponses
+from daedalus.learner.serving.query_responses import QueryResponses, page
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (

@@ -13,7 +13,7 @@ from processes import until
 
 from daedalus.learner.reporting import recorder
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import Recorder
 

@@ -1,6 +1,6 @@
-"""learner/serving/refused_joins.py: bounded, with one entry for each host and reason."""
+"""learner/serving/fleet.py: bounded, with one entry for each host and reason."""
 
-from daedalus.learner.serving.refused_joins import RefusedJoins
+from daedalus.learner.serving.fleet import RefusedJoins
 from daedalus.protocol.messages import Origin
 
 HERE = Origin(host="arm-box", software="daedalus-rl 1.0", address="tcp/10.0.0.7:1")

@@ -1,4 +1,4 @@
-"""learner/reporting/report.py: metrics rows, status, summary."""
+"""learner/reporting/run_reporter.py: metrics rows, status, summary."""
 
 import dataclasses
 import json
@@ -11,16 +11,16 @@ import pytest
 from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_spec
 
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
-from daedalus.learner.reporting.episode_hint import EpisodeHint
-from daedalus.learner.reporting.metrics import COLUMNS
-from daedalus.learner.reporting.rates import RateMeter
-from daedalus.learner.reporting.report import (
+from daedalus.learner.reporting.learning_hints import EpisodeHint
+from daedalus.learner.reporting.metrics_rows import COLUMNS
+from daedalus.learner.reporting.run_reporter import (
+    RateMeter,
+    RunReporter,
     episode_statistics,
     metrics_row,
     run_status,
     summary,
 )
-from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health
@@ -60,7 +60,7 @@ def test_rates_are_since_the_last_measurement() -> None:
     assert meter.measure(counters, joined_fleet(), 13.0) == stalled
 
 
-def test_rates_before_the_first_batch_and_after_the_last_are_unknown() -> None:
+def test_rates_before_the_first_batch_and_after_the_last_are_unknown_and_nothing_is_divided_by_0() -> None:
     counters = trained_counters()  # of the process before a resume
     meter = RateMeter(counters, 10.0)
     assert meter.measure(counters, joined_fleet(), 12.0) == {}
@@ -68,11 +68,7 @@ def test_rates_before_the_first_batch_and_after_the_last_are_unknown() -> None:
     everything = {"env_steps_per_second", "updates_per_second", "policy_lag_mean"}
     assert set(meter.measure(counters, joined_fleet(), 13.0, last=True)) == everything
     assert meter.measure(counters, joined_fleet(), 13.1, last=True) == {}
-
-
-def test_two_measurements_at_the_same_time_do_not_divide_by_0() -> None:
-    meter = RateMeter(RunCounters(100), 10.0)
-    assert meter.measure(trained_counters(), joined_fleet(), 10.0)["updates_per_second"] > 1e6
+    assert RateMeter(RunCounters(100), 10.0).measure(counters, joined_fleet(), 10.0)["updates_per_second"] > 1e6
 
 
 def test_a_run_without_the_end_of_an_episode_gets_a_hint_once() -> None:
@@ -191,31 +187,15 @@ def test_measure_sets_the_rate_of_each_actor() -> None:
 def test_summary_is_json_and_contains_bytes_per_env_step() -> None:
     counters = trained_counters(4.0)
     counters.seconds_to_target = 3.5
-    made = summary(
-        "run",
-        run_spec(algorithm="a3c", seed=4),
-        counters,
-        finished=True,
-        wall_seconds=4.5,
-        env_steps_per_second=4.0,
-    )
+    spec = run_spec(algorithm="a3c", seed=4)
+    made = summary("run", spec, counters, finished=True, wall_seconds=4.5, env_steps_per_second=4.0)
     assert json.loads(json.dumps(made)) == made
     assert made["rollout_bytes_per_env_step"] == 10.0
     assert (made["solved"], made["seconds_to_target"], made["seed"]) == (True, 3.5, 4)
     assert (made["policy_lag_mean"], made["policy_lag_max"], made["episode_return_mean"]) == (2.0, 2, 4.0)
-
-
-def test_summary_of_an_empty_run_does_not_divide_by_0() -> None:
-    made = summary(
-        "run",
-        run_spec(),
-        RunCounters(3),
-        finished=False,
-        wall_seconds=0.0,
-        env_steps_per_second=0.0,
-    )
-    assert made["rollout_bytes_per_env_step"] == 0.0
-    assert (made["solved"], made["seconds_to_target"], made["episode_return_mean"]) == (False, None, None)
+    empty = summary("run", spec, RunCounters(3), finished=False, wall_seconds=0.0, env_steps_per_second=0.0)
+    assert empty["rollout_bytes_per_env_step"] == 0.0
+    assert (empty["solved"], empty["seconds_to_target"], empty["episode_return_mean"]) == (False, None, None)
 
 
 def test_distributions_come_every_ten_seconds_and_with_the_last_row(tmp_path: Path) -> None:

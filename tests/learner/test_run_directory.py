@@ -1,8 +1,13 @@
-"""learner/run/run_directory.py: files of the run directory, and config.toml that reproduces the run."""
+"""The run directory: its files, and its lock."""
 
 import errno
 import json
+import os
+import signal
+import socket
+import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +15,10 @@ import pytest
 from building import run_spec
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import LIMIT
 
-from daedalus.learner.run import run_directory
+from daedalus.learner.run import run_directory, run_lock
+from daedalus.learner.run.run_lock import LOCK, RunInUseError, RunLock, is_locked
 from daedalus.learner.run.settings import SettingsError, read_preset
 from daedalus.learner.run.settings import run_spec as run_spec_of
 from daedalus.protocol.spec import RunSpec
@@ -65,17 +72,13 @@ def test_config_toml_reads_back_as_the_same_run(tmp_path_factory: pytest.TempPat
     assert run_directory.read_config(directory) == spec
 
 
-def test_config_toml_contains_defaults(tmp_path: Path) -> None:
-    run_directory.write_config(tmp_path, run_spec())
-    text = (tmp_path / run_directory.CONFIG).read_text()
-    assert "discount_factor = 0.99" in text
-    assert "checkpoint_seconds = 60.0" in text
-
-
-def test_config_toml_can_be_used_as_a_preset(tmp_path: Path) -> None:
+def test_config_toml_contains_defaults_and_can_be_used_as_a_preset(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"is not a run directory: it has no config\.toml"):
+        run_directory.read_config(tmp_path)
     run_directory.create(tmp_path, run_spec(algorithm="a3c", seed=9))
-    again = run_spec_of(read_preset(str(tmp_path / run_directory.CONFIG)))
-    assert again == run_spec(algorithm="a3c", seed=9)
+    path = tmp_path / run_directory.CONFIG
+    assert "discount_factor = 0.99" in path.read_text()
+    assert run_spec_of(read_preset(str(path))) == run_spec(algorithm="a3c", seed=9)
 
 
 def test_new_run_directory_contains_config_and_versions(tmp_path: Path) -> None:
@@ -99,14 +102,6 @@ def test_only_its_owner_may_enter_a_new_run_directory(tmp_path: Path) -> None:
     assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o755  # a directory of the user's stays as it is
 
 
-def test_existing_run_directory_is_refused_and_unchanged(tmp_path: Path) -> None:
-    directory = tmp_path / "run"
-    run_directory.create(directory, run_spec(seed=1))
-    with pytest.raises(SettingsError, match=r"exists: continue the run with `daedalus resume .*run`"):
-        run_directory.create(directory, run_spec(seed=2))
-    assert run_directory.read_config(directory).training.seed == 1
-
-
 def test_empty_directory_is_accepted_and_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     run_directory.create(tmp_path / "empty", run_spec())
@@ -117,11 +112,6 @@ def test_empty_directory_is_accepted_and_a_file_is_refused(tmp_path: Path) -> No
         run_directory.create(tmp_path, run_spec())
     with pytest.raises(SettingsError, match="Not a directory"):
         run_directory.create(tmp_path / "file" / "run", run_spec())
-
-
-def test_read_config_refuses_a_directory_without_config_toml(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"is not a run directory: it has no config\.toml"):
-        run_directory.read_config(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -203,3 +193,143 @@ def test_default_directory_is_named_after_the_run() -> None:
     directory = run_directory.default_directory("ALE/Pong-v5", run_spec(algorithm="a3c", seed=4))
     assert directory.parent == Path("runs")
     assert directory.name.startswith("ALE-Pong-v5-a3c-s4-")
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_lock, "_ENDING_SECONDS", 0.0)
+
+
+def test_a_second_lock_is_refused_with_the_holder_until_the_first_is_closed(tmp_path: Path) -> None:
+    with RunLock(tmp_path), pytest.raises(RunInUseError) as refused:
+        RunLock(tmp_path)
+    assert str(refused.value) == (
+        f"run directory {tmp_path} is in use by process {os.getpid()} on {socket.gethostname()}: "
+        "stop it first, or choose another --run-dir"
+    )
+    RunLock(tmp_path).close()
+
+
+@pytest.mark.parametrize("name", [LOCK, "metrics.csv", "events.jsonl", "checkpoints", "0"])
+def test_received_directory_with_links_is_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+    victim, run = tmp_path / "victim", tmp_path / "run"
+    run.mkdir()
+    victim.write_text("precious")
+    (run / name).symlink_to(victim)
+    with pytest.raises(SettingsError, match=rf"run directory .*/run: {name} is a link: remove it, or copy the"):
+        RunLock(run)
+    assert victim.read_text() == "precious"
+    assert os.listdir(run) == [name]
+    linked = tmp_path / "linked"  # the run directory itself may be a link
+    (run / name).unlink()
+    linked.symlink_to(run)
+    RunLock(linked).close()
+
+
+def test_whether_a_run_is_locked_can_be_asked(tmp_path: Path) -> None:
+    assert not is_locked(tmp_path)
+    with RunLock(tmp_path):
+        assert is_locked(tmp_path)
+    assert not is_locked(tmp_path)
+    (tmp_path / LOCK).unlink()
+    os.mkfifo(tmp_path / LOCK)
+    assert not is_locked(tmp_path)  # and it returns
+
+
+def test_a_child_process_holds_the_lock_until_it_is_killed(tmp_path: Path) -> None:
+    lock = RunLock(tmp_path)
+    words = [sys.executable, "-S", "-c", "import time; time.sleep(1000)"]
+    with subprocess.Popen(words, pass_fds=lock.inheritable) as child:
+        lock.close()
+        with pytest.raises(RunInUseError):
+            RunLock(tmp_path)
+        child.kill()
+        child.wait(LIMIT)
+        RunLock(tmp_path).close()
+
+
+def test_after_the_launcher_was_killed_its_learner_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_lock, "_LEAVING_SECONDS", LIMIT)
+    learner = "import time; time.sleep(1000)"
+    launcher = (
+        "import subprocess, sys, time; from pathlib import Path; from daedalus.learner.run.run_lock import RunLock\n"
+        f"lock = RunLock(Path({str(tmp_path)!r}))\n"
+        f"child = subprocess.Popen([sys.executable, '-S', '-c', {learner!r}], pass_fds=lock.inheritable, stdout=-3)\n"
+        "print(child.pid, flush=True); time.sleep(1000)"
+    )
+    with subprocess.Popen([sys.executable, "-c", launcher], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        process.kill()
+    waiting = threading.Timer(0.3, os.kill, (child, signal.SIGKILL))
+    waiting.start()
+    RunLock(tmp_path).close()
+    waiting.join()
+
+
+def test_a_holder_on_another_host_is_taken_to_run(tmp_path: Path) -> None:
+    with RunLock(tmp_path):
+        (tmp_path / LOCK).write_text("1 other-host.lan\n")
+        with pytest.raises(RunInUseError, match=r"in use by process 1 on other-host.lan"):
+            RunLock(tmp_path)
+        (tmp_path / LOCK).write_text("1 \x1b[31mhost\n")
+        with pytest.raises(RunInUseError, match="in use by another process"):
+            RunLock(tmp_path)
+
+
+def test_a_file_system_without_locks_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unsupported(_descriptor: int, _operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    assert run_lock.fcntl is not None
+    monkeypatch.setattr(run_lock.fcntl, "flock", unsupported)
+    RunLock(tmp_path).close()
+    assert caplog.messages == [
+        f"the file system of {tmp_path} has no locks: start no second learner in this run directory"
+    ]
+
+
+def test_a_directory_that_was_removed_meanwhile_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RunLock, "_try", lambda lock: (tmp_path / LOCK).unlink() is None)
+    with pytest.raises(RunInUseError, match="was removed by another process"):
+        RunLock(tmp_path)
+    with pytest.raises(SettingsError, match="No such file"):
+        RunLock(tmp_path / "nowhere")
+
+
+def test_a_new_run_is_locked_and_a_second_one_leaves_it_as_it_is(tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    with run_directory.create_locked(directory, run_spec(seed=1)):
+        with pytest.raises(RunInUseError):
+            RunLock(directory)
+        with pytest.raises(SettingsError, match="exists: continue the run"):
+            run_directory.create_locked(directory, run_spec(seed=2))
+    (tmp_path / "begun").mkdir()
+    with RunLock(tmp_path / "begun"), pytest.raises(RunInUseError):  # the first one has written nothing yet
+        run_directory.create_locked(tmp_path / "begun", run_spec(seed=2))
+    assert run_directory.read_config(directory).training.seed == 1
+
+
+def test_default_names_of_the_same_second_get_numbers(tmp_path: Path) -> None:
+    locks = [run_directory.create_locked(tmp_path / "runs" / "name", run_spec(), numbered=True) for _ in range(3)]
+    assert [lock.directory.name for lock in locks] == ["name", "name-2", "name-3"]
+    for lock in locks:
+        lock.close()
+
+
+def test_a_failed_start_leaves_no_run_directory_but_the_files_of_others(tmp_path: Path) -> None:
+    for name in ("failed", "other", "trained"):
+        run_directory.create(tmp_path / name, run_spec())
+        (tmp_path / name / "output.log.1").touch()
+        (tmp_path / name / "checkpoints").mkdir()
+    (tmp_path / "other" / "notes.txt").touch()
+    (tmp_path / "trained" / "checkpoints" / "0000000001").mkdir()
+    for name in ("failed", "other", "trained"):
+        run_directory.remove_failed(tmp_path / name)
+    assert not (tmp_path / "failed").exists()
+    assert [entry.name for entry in (tmp_path / "other").iterdir()] == ["notes.txt"]
+    assert (tmp_path / "trained" / "config.toml").exists()

@@ -1,9 +1,9 @@
-"""learner/serving/sequence_window.py: received sequence numbers, against a set of all numbers."""
+"""learner/serving/fleet.py: received sequence numbers, against a set of all numbers."""
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daedalus.learner.serving.sequence_window import SequenceWindow
+from daedalus.learner.serving.fleet import SequenceWindow
 
 WINDOW = 1024
 HUGE = 2**62

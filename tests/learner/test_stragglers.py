@@ -1,4 +1,4 @@
-"""learner/serving/stragglers.py: a connected actor that delivers nothing does not hold the updates for ever."""
+"""learner/serving/rollout_buffer.py: a connected actor that delivers nothing does not hold the updates for ever."""
 
 from collections.abc import Set
 

@@ -13,7 +13,7 @@ from processes import LIMIT, until
 from recorded_runs import record
 
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.trackers import tracking
 from daedalus.learner.reporting.trackers.tracker import TrackedRun
 from daedalus.learner.reporting.trackers.tracking import Tracking

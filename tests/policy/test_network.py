@@ -11,12 +11,16 @@ from plain import NAME, array_space, choices, vector_spaces
 from policies import POLICIES, Policy, make_policy, observations, spaces
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.testing import assert_close
 
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.custom_encoder import ObservationSpaces
 from daedalus.policy.network.encoders import Encoder, FlatEncoder, build_encoder
-from daedalus.policy.network.memory import Gru
+from daedalus.policy.network.layers import BytesConv2d, PReLU, orthogonal
+from daedalus.policy.network.perceptron import Perceptron
+from daedalus.policy.network.recurrent_memory import Gru
 from daedalus.policy.user_modules import NetworkError
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
 
 ENCODERS = ("small", "nature", "impala", "article")
@@ -319,3 +323,117 @@ def test_encoder_is_chosen_by_the_space(shape: tuple[int, ...], dtype: str, enco
     assert {name: value.shape for name, value in chosen.state_dict().items()} == {
         name: value.shape for name, value in named.state_dict().items()
     }
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("hidden", [(), (7,), (7, 3), (5, 6, 4)])
+@pytest.mark.parametrize("input_gradient", [False, True])
+def test_gradients_equal_those_of_the_layers(activation: str, hidden: tuple[int, ...], input_gradient: bool) -> None:
+    torch.manual_seed(4)
+    perceptron = Perceptron(5, hidden, "tanh" if activation == "tanh" else "relu")
+    inputs = torch.randn(11, 5, requires_grad=input_gradient)
+    weights = torch.randn(11, perceptron.features)
+
+    def results(module: nn.Module) -> list[torch.Tensor]:
+        outputs = module(inputs)
+        wanted = [*perceptron.parameters(), *([inputs] if input_gradient else [])]
+        return [outputs, *torch.autograd.grad((outputs * weights).sum(), wanted)] if wanted else [outputs]
+
+    for ours, theirs in zip(results(perceptron), results(nn.Sequential(*perceptron)), strict=True):
+        assert_close(ours, theirs)
+
+
+def test_gradients_equal_finite_differences() -> None:
+    perceptron = Perceptron(3, (4, 2), "tanh").double()
+    assert torch.autograd.gradcheck(perceptron, torch.randn(5, 3, dtype=torch.float64, requires_grad=True))
+
+
+def test_features_without_gradients_equal_those_with() -> None:
+    perceptron, inputs = Perceptron(3, (8, 8), "tanh"), torch.randn(6, 3)
+    with torch.no_grad():
+        assert_close(perceptron(inputs), perceptron(inputs.clone().requires_grad_()))
+    assert_close(perceptron(inputs).detach(), nn.Sequential(*perceptron)(inputs).detach())
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("hidden", [(7,), (8, 6)])
+def test_choices_have_the_features_and_gradients_of_one_hot_inputs(hidden: tuple[int, ...], activation: str) -> None:
+    """A column may be chosen by several rows. The reference: torch's own layers on the one-hot inputs."""
+    spaces: ObservationSpaces = {"place": DiscreteSpace(counts=(5,)), "dice": DiscreteSpace(counts=(3, 2))}
+    spec = PolicySpec.model_validate({"hidden": hidden, "activation": activation})
+    encoder = FlatEncoder(spaces, spec)
+    observations = {"place": torch.tensor([[4], [0], [4], [2]]), "dice": torch.tensor([[0, 1], [2, 0], [0, 0], [1, 1]])}
+    one_hot = torch.tensor(
+        [
+            [0, 0, 0, 0, 1, 1, 0, 0, 0, 1],
+            [1, 0, 0, 0, 0, 0, 0, 1, 1, 0],
+            [0, 0, 0, 0, 1, 1, 0, 0, 1, 0],
+            [0, 0, 1, 0, 0, 0, 1, 0, 0, 1],
+        ],
+        dtype=torch.float32,
+    )
+    parameters, outer = list(encoder.parameters()), torch.randn(4, hidden[-1])
+    expected = torch.nn.Sequential.forward(encoder.layers, one_hot)
+    features = encoder(observations)
+    torch.testing.assert_close(features, expected)
+    for found, wanted in zip(
+        torch.autograd.grad(features, parameters, outer), torch.autograd.grad(expected, parameters, outer), strict=True
+    ):
+        torch.testing.assert_close(found, wanted)
+    with torch.no_grad():
+        torch.testing.assert_close(encoder(observations), expected)
+
+
+@pytest.mark.parametrize("slope", [0.25, -0.5, 0.0, 1.5])
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("shape", [(3, 5, 4, 6), (1, 1, 1, 1), (2, 8, 16, 16)])
+def test_prelu_matches_torch(slope: float, memory_format: torch.memory_format, shape: tuple[int, ...]) -> None:
+    torch.manual_seed(3)
+    ours, theirs = PReLU(), nn.PReLU()
+    results = []
+    inputs, outer = torch.randn(shape), torch.randn(shape).contiguous(memory_format=memory_format)
+    inputs.flatten()[0] = 0.0  # torch treats zero as negative
+    for layer in (ours, theirs):
+        parameter = next(layer.parameters())
+        nn.init.constant_(parameter, slope)
+        given = inputs.contiguous(memory_format=memory_format).clone().requires_grad_()
+        outputs = layer(given)
+        outputs.backward(outer)
+        results.append((outputs.detach(), given.grad, parameter.grad))
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-5)
+
+
+def test_gradients_of_prelu_match_its_definition() -> None:
+    layer = PReLU().double()
+    inputs = torch.randn(3, 2, 4, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda given, _: layer(given), (inputs, layer.slope))
+
+
+def test_slope_of_prelu_has_a_gradient_in_bfloat16() -> None:
+    torch.manual_seed(3)
+    layer, inputs, outer = PReLU(), torch.randn(64, 32, 8, 8), torch.randn(64, 32, 8, 8)
+    layer(inputs.bfloat16().contiguous(memory_format=torch.channels_last)).backward(outer.bfloat16())
+    expected = (outer * inputs.clamp(max=0.0)).sum()
+    assert layer.slope.grad is not None
+    assert layer.slope.grad.dtype == torch.float32
+    torch.testing.assert_close(layer.slope.grad, expected.reshape(1), atol=0.5, rtol=0.01)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_convolution_of_bytes_scales_them_to_the_unit_interval(dtype: torch.dtype) -> None:
+    ours, plain = BytesConv2d(3, 8, 3), nn.Conv2d(3, 8, 3)
+    plain.load_state_dict(ours.state_dict())
+    images = torch.randint(0, 256, (2, 3, 9, 9)).float()
+    with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+        outputs = ours(images.to(dtype))
+    assert outputs.dtype == dtype
+    tolerance = 1e-5 if dtype == torch.float32 else 0.02
+    torch.testing.assert_close(outputs.float(), plain(images / 255.0), atol=tolerance, rtol=tolerance)
+
+
+def test_orthogonal_layers_scale_lengths_by_the_gain() -> None:
+    layer = orthogonal(nn.Linear(8, 8), 2.0)
+    inputs = torch.randn(5, 8)
+    torch.testing.assert_close(functional.linear(inputs, layer.weight).norm(dim=1), 2.0 * inputs.norm(dim=1))
+    assert (layer.bias == 0).all()

@@ -1,10 +1,10 @@
-"""policy/network/normalization.py: the statistics as parameters that every kind of snapshot carries exactly."""
+"""policy/network/observation_normalizer.py: statistics as parameters that every kind of snapshot carries exactly."""
 
 import numpy as np
 import pytest
 import torch
 
-from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.compact import bfloat16, float32
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace

@@ -1,4 +1,4 @@
-"""Sealed directories: reading detects every damage, and writing is atomic."""
+"""Files of policies: sealed directories, regular files only, and files that are replaced as a whole."""
 
 import errno
 import hashlib
@@ -7,6 +7,8 @@ import math
 import os
 import re
 import shutil
+import socket
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,13 +18,21 @@ import pytest
 import safetensors.numpy
 from plain import vector_spaces
 
+from daedalus.policy.saving.regular_files import (
+    append_own,
+    foreign_entry,
+    open_own,
+    open_regular,
+    read_regular,
+    replace_text,
+    replacing,
+)
 from daedalus.policy.saving.saved_policy import (
     FORMAT,
     PARAMETERS_FILE,
     PROGRAM_FILE,
     NoPolicyError,
     OtherFormatError,
-    checkpoints,
     find_policy,
     read_policy,
 )
@@ -69,11 +79,6 @@ def test_file_that_is_not_regular_is_damaged(sealed: Path, name: str) -> None:
     assert is_damaged(sealed)
 
 
-def test_missing_parents_are_created(tmp_path: Path) -> None:
-    write_sealed(tmp_path / "run" / "checkpoints" / "0001", FILES, CONTENT)
-    assert read_all(tmp_path / "run" / "checkpoints" / "0001") == (FILES, CONTENT)
-
-
 def test_manifest_is_plain_json(sealed: Path) -> None:
     manifest = json.loads((sealed / "manifest.json").read_bytes())
     assert manifest["content"] == CONTENT
@@ -87,31 +92,19 @@ def test_manifest_is_plain_json(sealed: Path) -> None:
 WRITTEN = [name for name, data in FILES.items() if data] + ["manifest.json", "seal"]
 
 
-@pytest.mark.parametrize("name", WRITTEN)
-def test_flipped_bit_is_detected(sealed: Path, name: str) -> None:
+@pytest.mark.parametrize("name", [*WRITTEN, "empty"])
+def test_file_that_is_flipped_truncated_longer_missing_or_a_folder_is_detected(sealed: Path, name: str) -> None:
     whole = (sealed / name).read_bytes()
+    damaged = [whole[:length] for length in range(len(whole))] + [whole + b"\0"]
     for position in range(len(whole)):
         torn = bytearray(whole)
         torn[position] ^= 1 << position % 8
-        (sealed / name).write_bytes(torn)
+        damaged.append(bytes(torn))
+    for data in damaged:
+        (sealed / name).write_bytes(data)
         assert is_damaged(sealed)
     (sealed / name).write_bytes(whole)
     assert read_all(sealed) == (FILES, CONTENT)
-
-
-@pytest.mark.parametrize("name", WRITTEN)
-def test_truncated_file_is_detected(sealed: Path, name: str) -> None:
-    whole = (sealed / name).read_bytes()
-    for length in range(len(whole)):
-        (sealed / name).write_bytes(whole[:length])
-        assert is_damaged(sealed)
-
-
-@pytest.mark.parametrize("name", [*WRITTEN, "empty"])
-def test_longer_missing_or_replaced_file_is_detected(sealed: Path, name: str) -> None:
-    with open(sealed / name, "ab") as file:
-        file.write(b"\0")
-    assert is_damaged(sealed)
     (sealed / name).unlink()
     assert is_damaged(sealed)
     (sealed / name).mkdir()
@@ -236,30 +229,18 @@ POLICY_CONTENT: dict[str, Any] = {
 POLICY_FILES = {PROGRAM_FILE: b"program", PARAMETERS_FILE: safetensors.numpy.save({"w": np.ones(3, np.float32)})}
 
 
-def test_saved_policy_is_read_back(tmp_path: Path) -> None:
-    write_sealed(tmp_path / "0007", POLICY_FILES, POLICY_CONTENT)
-    policy = read_policy(tmp_path / "0007")
-    assert (policy.policy_version, policy.program, policy.spec.environment.id) == (7, b"program", "CartPole-v1")
-    np.testing.assert_array_equal(policy.weights["w"], np.ones(3))
-
-
 @pytest.mark.parametrize(
     "changed",
     [
-        {"policy_version": None},
-        {"policy_version": "seven"},
-        {"policy_version": -1},
-        {"policy_version": 2**63},
-        {"policy_version": True},
-        {"policy_version": math.inf},
-        {"spec": {}},
-        {"spec": {**POLICY_CONTENT["spec"], "new_section": {}}},
-        {"spaces": None},
-        {"spaces": {}},
+        *({"policy_version": value} for value in (None, "seven", -1, 2**63, True, math.inf)),
+        *({"spec": value} for value in ({}, {**POLICY_CONTENT["spec"], "new_section": {}})),
+        *({"spaces": value} for value in (None, {})),
+        *({name: "absent"} for name in POLICY_CONTENT if name != "format"),
     ],
 )
 def test_policy_of_another_release_is_rejected_with_its_directory(tmp_path: Path, changed: dict[str, Any]) -> None:
-    write_sealed(tmp_path / "0007", POLICY_FILES, POLICY_CONTENT | changed)
+    content = {name: value for name, value in (POLICY_CONTENT | changed).items() if value != "absent"}
+    write_sealed(tmp_path / "0007", POLICY_FILES, content)
     with pytest.raises(DamagedError, match=re.escape(str(tmp_path / "0007"))):
         read_policy(tmp_path / "0007")
 
@@ -290,26 +271,11 @@ def test_a_directory_without_a_policy_is_named_with_the_reason(tmp_path: Path) -
         find_policy(tmp_path)
 
 
-@pytest.mark.parametrize("name", [name for name in POLICY_CONTENT if name != "format"])
-def test_incomplete_policy_is_rejected(tmp_path: Path, name: str) -> None:
-    content = {key: value for key, value in POLICY_CONTENT.items() if key != name}
-    write_sealed(tmp_path / "0007", POLICY_FILES, content)
-    with pytest.raises(DamagedError, match="another release"):
-        read_policy(tmp_path / "0007")
-
-
 @pytest.mark.parametrize("weights", [b"", b"junk", bytes(100)])
 def test_weights_that_are_not_safetensors_are_rejected(tmp_path: Path, weights: bytes) -> None:
     write_sealed(tmp_path / "0007", {**POLICY_FILES, PARAMETERS_FILE: weights}, POLICY_CONTENT)
     with pytest.raises(DamagedError, match="another release"):
         read_policy(tmp_path / "0007")
-
-
-def test_checkpoints_are_listed_newest_first(tmp_path: Path) -> None:
-    assert checkpoints(tmp_path) == []
-    for name in ("0000000009", "0000000010", ".0000000011.77.partial", "notes"):
-        (tmp_path / "checkpoints" / name).mkdir(parents=True)
-    assert [entry.name for entry in checkpoints(tmp_path)] == ["0000000010", "0000000009"]
 
 
 @pytest.mark.parametrize(
@@ -335,3 +301,134 @@ def test_manifest_of_another_form_under_a_right_seal_is_reported_as_damaged(tmp_
     (tmp_path / "seal").write_text(hashlib.sha256(manifest).hexdigest())
     with pytest.raises(DamagedError, match=str(tmp_path)):
         SealedDirectory(tmp_path)
+
+
+def test_beginning_of_a_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"content")
+    assert [read_regular(path, limit) for limit in (0, 3, 7, 2**60)] == [b"", b"con", b"content", b"content"]
+    with open_regular(path) as file:
+        file.seek(3)
+        assert file.read() == b"tent"
+
+
+def test_missing_file_and_folder_are_errors(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        read_regular(tmp_path / "missing", 10)
+    with pytest.raises(OSError, match=r"directory|[Pp]ermission"):
+        read_regular(tmp_path, 10)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs in folders")
+def test_other_kinds_of_files_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")  # nobody writes into it
+    for path in (tmp_path / "fifo", Path("/dev/zero")):
+        descriptors = len(os.listdir("/dev/fd"))
+        with pytest.raises(OSError, match="not a regular file") as error:
+            read_regular(path, 10)
+        assert error.value.filename == str(path)
+        assert len(os.listdir("/dev/fd")) == descriptors
+
+
+def _bind(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(os.path.relpath(path))
+
+
+VICTIM = b"precious"
+FOREIGN: dict[str, Callable[[Path, Path], object]] = {
+    "is a link": lambda path, victim: path.symlink_to(victim),
+    "has a name elsewhere, too": lambda path, victim: path.hardlink_to(victim),
+    "is not a regular file": lambda path, _: os.mkfifo(path),
+    "is not a regular": lambda path, _: _bind(path),
+}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs in folders")
+@pytest.mark.parametrize("reason", FOREIGN)
+def test_nothing_is_written_through_what_no_run_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    victim, run = tmp_path / "victim", tmp_path / "run"
+    victim.write_bytes(VICTIM)
+    (run / "checkpoints" / "0000000001").mkdir(parents=True)
+    for path in (run / "metrics.csv", run / "checkpoints" / "0000000001" / "seal"):
+        assert foreign_entry(run) == ""
+        FOREIGN[reason](path, victim)
+        shared = reason.startswith("has") and path.name == "seal"  # checkpoints have files in common
+        relative = os.path.relpath(path, run)
+        assert foreign_entry(run).startswith("" if shared else f"{relative} {reason}")
+        for flags in (os.O_RDWR | os.O_CREAT, os.O_WRONLY | os.O_APPEND):
+            with pytest.raises(OSError):  # noqa: PT011 - a FIFO and a socket have reasons of the system
+                os.close(open_own(path, flags))
+        path.unlink()
+    assert victim.read_bytes() == VICTIM
+
+
+def test_linked_folder_is_foreign_and_that_of_a_tracker_is_not_searched(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    (run / "wandb").mkdir(parents=True)
+    (run / "wandb" / "latest-run").symlink_to(tmp_path)
+    assert foreign_entry(run) == ""
+    (run / "checkpoints").symlink_to(tmp_path)
+    assert foreign_entry(run) == "checkpoints is a link: remove it, or copy the directory without it"
+
+
+@pytest.mark.parametrize("name", ["config.toml", "evaluation.json", "metrics.csv", "learner.lock", "operator-token"])
+def test_folder_where_a_run_has_a_file_is_foreign(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir()
+    assert foreign_entry(tmp_path).startswith(f"{name} is a folder, but a run has a file of this name: remove it")
+
+
+def test_file_in_place_of_the_checkpoints_is_foreign(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").touch()
+    assert foreign_entry(tmp_path).startswith("checkpoints is a file, but a run has a folder of this name: remove it")
+
+
+def test_own_file_is_appended_to(tmp_path: Path) -> None:
+    for _ in range(2):
+        with append_own(tmp_path / "events.jsonl") as file:
+            file.write(b"line\n")
+    assert (tmp_path / "events.jsonl").read_bytes() == b"line\n" * 2
+
+
+def test_a_file_keeps_its_content_until_the_new_one_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    replace_text(path, "old")
+    with replacing(path) as beside:
+        beside.write_bytes(b"new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_an_error_keeps_the_old_file_and_leaves_no_other(tmp_path: Path, error: type[BaseException]) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text("old")
+
+    def fail() -> None:
+        with replacing(path) as beside:
+            beside.write_text("ne")
+            raise error
+
+    with pytest.raises(error):
+        fail()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("private", [False, True])
+def test_others_cannot_read_a_private_file_while_it_is_written_either(tmp_path: Path, *, private: bool) -> None:
+    path = tmp_path / "token"
+    with replacing(path, private=private) as beside:
+        modes = [beside.stat().st_mode]
+        beside.write_text("secret")
+    modes.append(path.stat().st_mode)
+    assert [bool(stat.S_IMODE(mode) & 0o077) for mode in modes] == [not private] * 2
+
+
+def test_a_missing_folder_is_an_error_that_names_a_file_in_it(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        replace_text(tmp_path / "nowhere" / "text", "text")

@@ -1,5 +1,6 @@
 """Hypothesis strategies for every kind of message."""
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from daedalus.protocol.messages import (
     MetricsReport,
     MetricsRequest,
     OrderRequest,
-    Origin,
     Program,
     Refusal,
     RefusedJoin,
@@ -117,40 +117,27 @@ run_specs = st.builds(
     evaluation=st.builds(EvaluationSpec, seconds=st.none() | st.floats(0.1, 1e4)),
     service=st.builds(ServiceSpec, log_seconds=st.floats(0.01, 100)),
 )
-actor_statuses = st.builds(
-    ActorStatus,
-    epsilon=floats,
-    rollouts_rejected=st.dictionaries(text, counters, max_size=3),
-    **dict.fromkeys(("actor", "host", "software", "address", "quarantined", "safe_reason"), text),
-    **dict.fromkeys(("deadlines", "missed_deadlines", "overridden_actions"), counters),
-    **dict.fromkeys(("safe_actions", "rollouts_dropped"), counters),
-    **dict.fromkeys(("seconds_since_seen", "env_steps_per_second"), floats),
-    **dict.fromkeys(("bytes_up_per_hour", "bytes_down_per_hour"), floats),
-    **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed"), counters),
-    **dict.fromkeys(("busy_answers", "env_steps", "policy_lag"), counters),
-)
-events = st.builds(Event, time=text, actor=text, text=text, count=counters)
-refused_joins = st.builds(
-    RefusedJoin,
-    count=counters,
-    seconds_since_last=floats,
-    **dict.fromkeys(("actor", "host", "software", "reason"), text),
-)
-statuses = st.builds(
+for of_kind, strategy in ((str, text), (int, counters), (float, floats)):
+    st.register_type_strategy(of_kind, strategy)
+
+
+def inferred(kind: type, **chosen: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    """Return a strategy whose fields have the strategies of their types, unless others are chosen."""
+    return st.builds(kind, **{**dict.fromkeys(inspect.signature(kind).parameters, ...), **chosen})
+
+
+def few(content: st.SearchStrategy[Any]) -> st.SearchStrategy[tuple[Any, ...]]:
+    return st.lists(content, max_size=3).map(tuple)
+
+
+rejections = st.dictionaries(text, counters, max_size=3)
+actor_statuses = inferred(ActorStatus, rollouts_rejected=rejections)
+statuses = inferred(
     RunStatus,
-    refused_joins=st.lists(refused_joins, max_size=3).map(tuple),
-    episode_return_mean=st.none() | floats,
-    actors=st.lists(actor_statuses, max_size=3).map(tuple),
-    problems=st.lists(text, max_size=3).map(tuple),
-    checkpoint_age_seconds=st.none() | floats,
-    certificate_days_left=st.none() | floats,
-    rollouts_rejected=st.dictionaries(text, counters, max_size=3),
-    **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), counters),
-    **dict.fromkeys(("actors_alive", "actors_quarantined", "actors_gone"), counters),
-    **dict.fromkeys(("rollouts_accepted", "rollouts_missed", "busy_answers"), counters),
-    **dict.fromkeys(("run", "algorithm", "environment"), text),
-    **dict.fromkeys(("learner_epoch", "env_steps", "env_steps_budget", "updates"), counters),
-    **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second", "policy_lag_mean"), floats),
+    rollouts_rejected=rejections,
+    problems=few(text),
+    refused_joins=few(inferred(RefusedJoin)),
+    actors=few(actor_statuses),
 )
 
 
@@ -282,65 +269,30 @@ def metrics_reports(draw: st.DrawFn) -> MetricsReport:
     )
 
 
+programs = st.binary(max_size=300).map(lambda data: np.frombuffer(data, "|u1"))
 KINDS: dict[type, st.SearchStrategy[Any]] = {
-    Join: st.builds(
-        Join,
-        actor=text,
-        incarnation=counters,
-        spaces=st.none() | spaces,
-        environments=st.integers(0, 4096),
-        origin=st.builds(Origin, host=text, software=text, address=text),
-        failure=text,
-    ),
-    Welcome: st.builds(
-        Welcome,
-        run=text,
-        learner_epoch=counters,
-        seed=counters,
-        epsilon=st.floats(0, 1),
-        spec=run_specs.map(RunSpec.for_actors),
-    ),
-    Refusal: st.builds(Refusal, reason=text),
-    Program: st.builds(Program, hash=text, model=st.binary(max_size=300).map(lambda data: np.frombuffer(data, "|u1"))),
+    Join: inferred(Join, spaces=st.none() | spaces, environments=st.integers(0, 4096)),
+    Welcome: inferred(Welcome, epsilon=st.floats(0, 1), spec=run_specs.map(RunSpec.for_actors)),
+    Refusal: inferred(Refusal),
+    Program: inferred(Program, model=programs),
     Rollout: rollouts(),
     Gradient: gradients(),
-    Acknowledgement: st.builds(Acknowledgement, reason=text, policy_version=counters),
+    Acknowledgement: inferred(Acknowledgement),
     Snapshot: snapshots(),
-    SnapshotRequest: st.builds(
-        SnapshotRequest,
-        actor=text,
-        held_version=st.none() | counters,
-        policy_version=st.none() | counters,
-        part=counters,
-        compact=st.booleans(),
-    ),
+    SnapshotRequest: inferred(SnapshotRequest),
     SnapshotPart: snapshot_parts(),
     CompactSnapshot: compact_snapshots(),
-    EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
+    EvaluationRequest: inferred(EvaluationRequest),
     EvaluationReport: evaluation_reports(),
-    ClientReport: st.builds(
-        ClientReport,
-        actor=text,
-        safe_reason=text,
-        **dict.fromkeys(("incarnation", "deadlines", "missed_deadlines", "overridden_actions"), counters),
-        **dict.fromkeys(("safe_actions", "rollouts_dropped"), counters),
-    ),
-    RunEnded: st.builds(
-        RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
-    ),
-    StatusReport: st.builds(StatusReport, status=statuses),
-    EventsRequest: st.builds(EventsRequest),
-    EventsReport: st.builds(
-        EventsReport,
-        page=st.builds(EventsPage, run=text, learner_epoch=counters, events=st.lists(events, max_size=3).map(tuple)),
-    ),
-    ActorsRequest: st.builds(ActorsRequest, after=text),
-    MetricsRequest: st.builds(MetricsRequest, first=counters),
+    ClientReport: inferred(ClientReport),
+    RunEnded: inferred(RunEnded),
+    StatusReport: inferred(StatusReport, status=statuses),
+    EventsRequest: inferred(EventsRequest),
+    EventsReport: inferred(EventsReport, page=inferred(EventsPage, events=few(inferred(Event)))),
+    ActorsRequest: inferred(ActorsRequest),
+    ActorsReport: inferred(ActorsReport, page=inferred(ActorsPage, actors=few(actor_statuses))),
+    MetricsRequest: inferred(MetricsRequest),
     MetricsReport: metrics_reports(),
-    OrderRequest: st.builds(OrderRequest, order=st.sampled_from(["stop", "checkpoint"])),
-    ActorsReport: st.builds(
-        ActorsReport,
-        page=st.builds(ActorsPage, learner_epoch=counters, actors=st.lists(actor_statuses, max_size=3).map(tuple)),
-    ),
+    OrderRequest: inferred(OrderRequest),
 }
 messages = st.one_of(*KINDS.values())

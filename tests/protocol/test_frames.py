@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain import ACTION, NAME, plain_spaces
 
-from daedalus.actor.environments.interface import Observed, Step
+from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.policy.acting.noise import Noise, NoiseSize
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.codec import decode, encode

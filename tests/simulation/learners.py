@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.updates import updates_of
+from daedalus.learner.run.counters import RunCounters, updates_of
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.spaces import Spaces

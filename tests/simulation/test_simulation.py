@@ -13,8 +13,8 @@ import pytest
 from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.fleet import SequenceWindow
 from daedalus.learner.serving.rollout_judge import RolloutJudge
-from daedalus.learner.serving.sequence_window import SequenceWindow
 from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.uploads import Rollout
 

@@ -444,7 +444,7 @@ def test_exception_in_a_callback_reaches_the_threads_excepthook(
     if callback == "handler":
         client.serve("d/r/join", raise_fault)
         settle(client, router)
-        assert router.query("d/r/join", timeout=2.0) == []
+        assert router.query("d/r/join", timeout=0.5) == []
     elif callback == "answer":
         client.query_async("d/r/join", b"", timeout=WAIT, on_answer=raise_fault)
     elif callback == "subscriber":

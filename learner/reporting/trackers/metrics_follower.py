@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from daedalus.learner.reporting.metrics_file import numbers
+from daedalus.learner.reporting.metrics_rows import numbers
 
 
 class MetricsFollower:

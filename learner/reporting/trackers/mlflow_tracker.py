@@ -8,7 +8,7 @@ from contextlib import suppress
 from itertools import islice
 from typing import Any
 
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.trackers.tracker import PROJECT, SUMMARY, TrackedRun, flat, tagged
 from daedalus.protocol.texts import without_secrets
 

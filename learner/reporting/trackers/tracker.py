@@ -1,14 +1,16 @@
-"""Interface of an experiment tracker, and the trackers by name."""
+"""Interface of an experiment tracker, the trackers by name, and a metrics writer of the user's as one of them."""
 
 import importlib
 import importlib.util
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from daedalus.learner.reporting.metrics import Details, MetricsWriter, tag
+from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter, tag
 from daedalus.learner.run.run_directory import run_name
+from daedalus.policy.user_modules import UserModules, modules_of
 
 PROJECT = "daedalus"  # project or experiment of the runs, unless the tracker's environment variable names another
 SUMMARY = "summary/"  # prefix of the results of a run
@@ -20,6 +22,7 @@ _CLASSES = {
     "trackio": ("trackio_tracker", "TrackioTracker"),
 }
 TRACKERS = tuple(_CLASSES)
+_OPTION = "--log"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,14 +60,52 @@ class Tracker(MetricsWriter, Protocol):
 OpenTracker = Callable[[TrackedRun], Tracker]
 
 
+def tracker_name(name: str) -> str:
+    """Return the name of a tracker or of the user's metrics writer, `module:Class`. Raises ValueError for another."""
+    if name not in TRACKERS and re.fullmatch(r"\w+(\.\w+)*:\w+", name) is None:
+        raise ValueError(f"unknown tracker {name!r}: choose from {', '.join(TRACKERS)}, or write module:Class")
+    return name
+
+
 def tracker_class(name: str) -> OpenTracker:
-    """Import the class of a tracker. Its constructor imports the package. Raises KeyError for an unknown name."""
+    """Import the class of a tracker; its constructor imports the package. The user has named it, if it is their own.
+
+    Raises KeyError for an unknown name, UserModuleError if the user's class cannot be imported.
+    """
+    if ":" in name:
+        modules = UserModules(frozenset(modules_of({_OPTION: name})))
+        kind = modules.attribute(_OPTION, name)
+        return lambda run: OwnWriter(name, kind(run))
     module, of = _CLASSES[name]
     return getattr(importlib.import_module(f"daedalus.learner.reporting.trackers.{module}"), of)
 
 
+class OwnWriter:
+    """A metrics writer of the user's as a tracker that has no run of its own to continue."""
+
+    id = ""
+
+    def __init__(self, name: str, writer: MetricsWriter) -> None:
+        self.place, self._writer = f"metrics go to {name}", writer
+
+    def write(self, row: Mapping[str, float], details: Details) -> None:
+        """See MetricsWriter."""
+        self._writer.write(row, details)
+
+    def summarize(self, summary: Mapping[str, Any]) -> None:
+        """Give the results to a writer that has this method. See Tracker."""
+        if summarize := getattr(self._writer, "summarize", None):
+            summarize(summary)
+
+    def close(self) -> None:
+        """See MetricsWriter."""
+        self._writer.close()
+
+
 def is_installed(name: str) -> bool:
     """Return whether the package of a tracker is installed, without importing it."""
+    if ":" in name:  # of the user's own: its process reports a module that is missing
+        return True
     found = importlib.util.find_spec(name)
     return found is not None and found.origin is not None  # a folder such as ./wandb is a package without origin
 

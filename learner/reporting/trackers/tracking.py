@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from daedalus.learner.reporting.metrics import GROUPS, Details
+from daedalus.learner.reporting.metrics_rows import GROUPS, Details
 from daedalus.learner.reporting.trackers.metrics_follower import MetricsFollower
 from daedalus.learner.reporting.trackers.tracker import OpenTracker, TrackedRun, Tracker, flat
 from daedalus.learner.reporting.trackers.tracking_state import TrackingState

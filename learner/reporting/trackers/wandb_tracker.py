@@ -5,7 +5,7 @@ import secrets
 from collections.abc import Mapping
 from typing import Any
 
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.trackers.tracker import PROJECT, SUMMARY, TrackedRun, tagged
 from daedalus.policy.user_code import message_line
 

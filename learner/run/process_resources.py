@@ -1,10 +1,13 @@
-"""File descriptors that are kept for the files of a run: connections of peers use up all others.
+"""What a learner process sets up with the operating system: reserved file descriptors, and an allocator that is fast.
 
-A connection is accepted by the network's own threads, before anybody knows whose it is. So the limit of this process
-stays below what the system allows, and is raised only while a thread writes files.
+Connections of peers use up all file descriptors that are not reserved for the files of the run. A connection is
+accepted by the network's own threads, before anybody knows whose it is. So the limit of this process stays below what
+the system allows, and is raised only while a thread writes files.
 """
 
 import contextlib
+import ctypes
+import sys
 import threading
 from collections.abc import Iterator
 
@@ -52,3 +55,22 @@ def _limit(descriptors: int) -> None:
 
     with contextlib.suppress(ValueError, OSError):  # somebody has lowered the hard limit since
         resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
+_NEVER = 2**31 - 1
+
+
+def keep_freed_memory() -> None:
+    """Make the allocator keep freed memory, instead of mapping and unmapping large tensors at each step.
+
+    Call this function before the first tensor is created. It does nothing if the C library is not glibc.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    mallopt(_M_MMAP_THRESHOLD, 1 << 30)
+    mallopt(_M_TRIM_THRESHOLD, _NEVER)

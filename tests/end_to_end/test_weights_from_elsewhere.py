@@ -1,11 +1,14 @@
-"""A run with --init-from that was stopped before its first checkpoint, and is resumed, with real processes."""
+"""Weights of another run, and a policy that goes to the Hub and back."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hub_server import TOKEN, serving
 from processes import Running
+from recorded_runs import record
 from saved_runs import CARTPOLE, save
 
 from daedalus.learner.run import run_directory
@@ -52,3 +55,26 @@ def test_a_resumed_run_without_checkpoints_begins_with_the_weights_of_the_other_
         r"but /.*/first does not exist"
     )
     assert "Traceback" not in refused.output
+
+
+pytest.importorskip("huggingface_hub")
+
+
+def test_a_policy_goes_to_the_hub_and_back(
+    tmp_path: Path, start: Callable[..., Running], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(record(tmp_path / "run"), CARTPOLE, 4)
+    with serving() as hub:
+        for name, value in {
+            "HF_ENDPOINT": hub.address,
+            "HF_HOME": str(tmp_path / "home"),
+            "HF_TOKEN": TOKEN,
+            "HF_HUB_DISABLE_XET": "1",
+        }.items():
+            monkeypatch.setenv(name, value)
+        pushed = start("push", "run", "ada/cart")
+        assert pushed.wait() == 0, pushed.output
+        assert pushed.lines[-1].startswith(f"pushed to {hub.address}/ada/cart/commit/")
+        evaluated = start("evaluate", "--from-hub", "ada/cart", "--episodes", 2, "--json")
+        assert evaluated.wait() == 0, evaluated.output
+        assert json.loads(evaluated.lines[-1])["policy_version"] == 4

@@ -1,0 +1,231 @@
+"""What a run begins with or is resumed from: weights of another run, changed settings, whether it has finished.
+
+Without torch, so that a command can import it early.
+"""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from daedalus.learner.run.counters import RunCounters, check_counters
+from daedalus.learner.run.run_directory import SUMMARY, VERSIONS, read_json
+from daedalus.learner.run.settings import SettingsError, override, run_spec
+from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
+from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
+from daedalus.protocol.texts import exact_number
+
+# They define what is learned, and by what: the weights, the statistics of the optimiser and the results so far belong
+# to them.
+_FIXED_SECTIONS = ("environment.", "policy.")
+_FIXED = {"training.algorithm", "training.optimizer", "training.seed", "training.normalize_rewards"}
+_CHANGEABLE = {"environment.max_episode_steps", "environment.processes"}
+
+
+def with_changes(spec: RunSpec, assignments: Sequence[str], directory: Path) -> RunSpec:
+    """Return the specification of a run with `section.key=value` assignments applied.
+
+    Raises SettingsError for an invalid assignment, and for settings that cannot change when the run in `directory` is
+    resumed.
+    """
+    settings = spec.model_dump(mode="json", exclude_none=True)
+    override(settings, assignments)
+    try:
+        changed = run_spec(settings)
+        fixed = fixed_changes(spec, changed)
+    except SettingsError:  # perhaps because others would have to change with a setting that cannot
+        fixed = [name for name in _named(assignments) if _is_fixed(name) and name in _values(spec)]
+        if not fixed:
+            raise
+        changed = spec
+    if fixed:
+        changes = [word for assignment in assignments for word in ("--set", assignment)]
+        words = ["daedalus", "train", f"{directory}/config.toml", "--init-from", str(directory), *changes]
+        raise SettingsError(
+            f"{' and '.join(fixed)} cannot change when a run is resumed: start a new run from the weights of this one, "
+            f"such as with: {shlex.join(words)}"
+        )
+    return changed
+
+
+def fixed_changes(before: RunSpec, after: RunSpec) -> list[str]:
+    """Return the settings that differ and cannot change when a run is resumed, as `section.key`."""
+    return [name for name in differing(before, after) if _is_fixed(name)]
+
+
+def differing(before: RunSpec, after: RunSpec) -> list[str]:
+    """Return the settings in which two specifications differ, as `section.key`."""
+    old = _values(before)
+    return [name for name, value in _values(after).items() if value != old[name]]
+
+
+def _named(assignments: Sequence[str]) -> list[str]:
+    return [assignment.partition("=")[0].strip() for assignment in assignments]
+
+
+def _is_fixed(name: str) -> bool:
+    return name not in _CHANGEABLE and (name in _FIXED or name.startswith(_FIXED_SECTIONS))
+
+
+def _values(spec: RunSpec) -> dict[str, Any]:
+    return {
+        f"{section}.{key}": value
+        for section, values in spec.model_dump(mode="json").items()
+        for key, value in values.items()
+    }
+
+
+def check_initial(directory: Path | None, *, other_spaces: bool = False) -> None:
+    """Raise SettingsError if no policy can be read from a directory, that of --init-from; None: there is none.
+
+    `other_spaces` is --allow-other-spaces, which needs a directory.
+    """
+    if other_spaces and directory is None:
+        raise SettingsError("--allow-other-spaces is for the weights of another run: add --init-from, or leave it out")
+    _check(directory, "--init-from: ")
+
+
+def allows_other_spaces(directory: Path) -> bool:
+    """Return whether a run was started with --allow-other-spaces, as its versions.json says. Raises SettingsError."""
+    return (directory / VERSIONS).exists() and read_json(directory / VERSIONS).get("init_from_other_spaces") is True
+
+
+def initial_to_resume(directory: Path) -> Path | None:
+    """Return the run whose weights a resumed run still has to begin with, or None.
+
+    A run that was stopped before its first checkpoint begins with them again; versions.json names their run. Raises
+    SettingsError if no policy can be read from there.
+    """
+    if checkpoints(directory) or not (directory / VERSIONS).exists():
+        return None
+    recorded = read_json(directory / VERSIONS).get("init_from")
+    initial = None if recorded is None else Path(recorded)
+    _check(initial, f"the run in {directory} has no checkpoint, and begins with the weights of another run, but ")
+    return initial
+
+
+def _check(initial: Path | None, source: str) -> None:
+    if initial is not None:
+        try:
+            find_policy(initial)
+        except (DamagedError, NoPolicyError) as error:
+            raise SettingsError(f"{source}{error}") from None
+
+
+def other_spaces(policy: SavedPolicy, environment: EnvironmentSpec, spaces: Spaces) -> str:
+    """Return what differs between the spaces of a policy and those of a run, or an empty string.
+
+    Weights fit wherever the shapes do, but a policy means nothing by numbers of another name, order or scale.
+    """
+    found = [
+        *_components("observation", policy.spaces.observations, spaces.observations),
+        *_components("action", policy.spaces.actions, spaces.actions),
+    ]
+    for name in ("action_table", "action_table_columns"):  # what the choices mean
+        if getattr(policy.spec.environment, name) != getattr(environment, name):
+            found.append(f"environment.{name} is another")
+    return "; ".join(found)
+
+
+def _components(kind: str, before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    missing, new = (", ".join(sorted(one.keys() - other.keys())) for one, other in ((before, now), (now, before)))
+    found = [f"{kind} {missing} is not in this run"] if missing else []
+    found += [f"{kind} {new} is not in that run"] if new else []
+    for name in before.keys() & now.keys():
+        if before[name] != now[name]:
+            found.append(f"{kind} {name} is {_in_detail(before[name])} there, and {_in_detail(now[name])} here")
+    if not found and list(before) != list(now):
+        found.append(f"the components of the {kind} are in the order {', '.join(before)} there, {', '.join(now)} here")
+    return found
+
+
+def _in_detail(space: Any) -> str:
+    """Return a space in words, with what differs between spaces of the same words."""
+    if isinstance(space, ContinuousSpace) and len(set(zip(space.low, space.high, strict=True))) > 1:
+        return f"{space} (low {_some(space.low)}, high {_some(space.high)})"
+    if isinstance(space, DiscreteSpace) and space.size > 8:
+        return f"{space} ({_some(space.counts)})"
+    return str(space)
+
+
+def _some(values: tuple[float | None, ...]) -> str:
+    texts = ["none" if value is None else f"{value:g}" for value in values[:8]]
+    return " ".join([*texts, *(["..."] if len(values) > 8 else [])])
+
+
+def other_network(policy: SavedPolicy, spec: PolicySpec, spaces: Spaces) -> str:
+    """Return the first setting by which a run's network computes something else from equal weights, or an empty string.
+
+    Settings that change names or shapes of weights are left to the loading of the weights. Needs torch.
+    """
+    from daedalus.policy.network.encoders import encoder_names
+
+    before = policy.spec.policy
+    names = encoder_names(before, policy.spaces.observations), encoder_names(spec, spaces.observations)
+    different = {"encoder": names}
+    if "mlp" in names[1] or ":" in names[1]:
+        different["activation"] = before.activation, spec.activation
+    if any(isinstance(space, ContinuousSpace) for space in spaces.actions.values()):
+        different["distribution"] = before.distribution, spec.distribution
+    for name, (there, here) in different.items():
+        if there != here:
+            return f"policy.{name} is {there} there, and {here} here: use the same [policy] settings"
+    return ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinishedRun:
+    """Run that has nothing left to train."""
+
+    reason: str  # why, and how to go on
+    missed: bool  # whether the budget was used up before the target at which the run was to stop
+    to_evaluate: bool  # whether training ended by itself, and the final evaluation is missing
+
+
+def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
+    """Return how a run has finished under a specification, or None if there is something left to train.
+
+    A learner that was killed between its last checkpoint and its summary has to be started again.
+    """
+    counters = _newest_counters(directory, spec)
+    try:
+        summary = read_json(directory / SUMMARY)
+    except SettingsError:
+        return None
+    if counters is None or summary.get("env_steps") != counters.env_steps:
+        return None
+    training = spec.training
+    solved = counters.is_solved(spec) and bool(summary.get("solved"))  # not while new episodes have to confirm it
+    if solved and training.stop_when_solved:
+        reason = (
+            f"the target return {exact_number(training.target_return)} was reached, and {counters.env_steps:,} "
+            "env_steps are done: train on with --set training.stop_when_solved=false, or raise training.target_return"
+        )
+    elif counters.env_steps >= training.env_steps:
+        reason = (
+            f"{counters.env_steps:,} env_steps are done, and the budget is {training.env_steps:,}: "
+            "raise it with --env-steps"
+        )
+    else:
+        return None
+    missed = training.target_return is not None and training.stop_when_solved and not solved
+    to_evaluate = bool(summary.get("finished")) and summary.get("evaluation") is None
+    return FinishedRun(reason=reason, missed=missed, to_evaluate=to_evaluate)
+
+
+def _newest_counters(directory: Path, spec: RunSpec) -> RunCounters | None:
+    for checkpoint in checkpoints(directory):
+        counters = RunCounters(spec.training.target_episodes)
+        try:
+            counters.restore(check_counters(SealedDirectory(checkpoint).content["counters"]))
+        except (DamagedError, KeyError, ValueError):
+            continue  # the learner reports it
+        return counters
+    return None
+
+
+class CheckpointMismatchError(Exception):
+    """Error for a checkpoint of another network or optimiser."""
