@@ -16,9 +16,8 @@ from typing import Literal
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError, NoLearnerError
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.own_name import own_name
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig, own_name
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import FAILED, status_at_start
 from daedalus.policy.acting.runtime import PolicyError

@@ -29,11 +29,12 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
 from daedalus.learner.reporting.recorder import OpenWriter
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
-from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
+from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.resuming import (
+    Beginning,
     CheckpointMismatchError,
     allows_other_spaces,
     differing,
@@ -43,8 +44,9 @@ from daedalus.learner.run.resuming import (
 )
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.service import LearnerService, Outcome, Outputs
 from daedalus.learner.serving.rollout_intake import largest_request
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import NetworkError, UserModules, allow_settings, allow_words, modules_of, shown_path
@@ -266,7 +268,6 @@ class LearnerProcess:
         run = run if run.exists else self._with_directory(run, stack)
         try:
             service = self._service(run, transport, restored, initial, spaces)
-            self._context["epoch"] = f"{service.learner_epoch:x}"
             self._announce(run)
             if options.prepared is None:  # else the launcher starts them
                 output = stack.enter_context(
@@ -299,24 +300,22 @@ class LearnerProcess:
         spaces: Spaces | None,
     ) -> LearnerService:
         options = self._options
-        return LearnerService(
-            run.spec,
-            run.directory,
-            transport,
-            self._stop,
-            self._progress,
-            _writers(run.directory, options.rows_to),
-            started=options.started,
+        context = RunContext.begin(
+            run.directory, run.spec, self._stop, started=options.started, spaces=spaces, restored=restored
+        )
+        context.health.certificate_days_left = partial(certificate_days_left, self._credentials)
+        beginning = Beginning(
             restored=restored,
             initial=initial,
-            other_spaces=options.new.other_spaces or allows_other_spaces(run.directory),
-            spaces=spaces,
-            modules=run.modules,
-            certificate_days_left=partial(certificate_days_left, self._credentials),
-            user_metrics=self._user_metrics,
-            confirms=options.confirms or (options.prepared is None and _confirms(run.spec)),
+            allows_other_spaces=options.new.other_spaces or allows_other_spaces(run.directory),
             reset_statistics=options.reset_statistics,
+            modules=run.modules,
         )
+        writers = _writers(run.directory, options.rows_to)
+        outputs = Outputs(progress=self._progress, writers=writers, user_metrics=self._user_metrics)
+        self._context["epoch"] = f"{context.learner_epoch:x}"
+        confirms = options.confirms or (options.prepared is None and _confirms(run.spec))
+        return LearnerService(context, transport, outputs, beginning, confirms=confirms)
 
     def _with_spaces(self, run: ChosenRun) -> tuple[ChosenRun, Spaces | None]:
         """Return the run with the default settings of its spaces, and the spaces; None if they are not known here."""

@@ -43,7 +43,7 @@ from daedalus.launch.process_lifecycle import (
     stop_on_signals,
 )
 from daedalus.launch.run_choice import create_run, with_record
-from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
+from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.resuming import finished_run, initial_to_resume, with_changes
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
