@@ -29,7 +29,7 @@ from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 
-_logger = logging.getLogger("daedalus.cli")
+_logger = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.2
 _FORBIDDEN = (

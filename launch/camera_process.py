@@ -31,7 +31,7 @@ from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.messages import Message, Program, Snapshot, Welcome
 
-_logger = logging.getLogger("daedalus.cli")
+_logger = logging.getLogger("daedalus.launch.camera_process")
 
 
 class CheckpointValues:

@@ -73,7 +73,7 @@ _QUIET_SECONDS = 2.0  # of waiting, before the user is informed
 _POLL_SECONDS = 0.05
 _NICENESS = 10  # more than that of actors; with 19, a package may take minutes to import on a busy machine
 
-_logger = logging.getLogger(__name__)
+_logger = logging.getLogger("daedalus.launch.tracker_processes")  # this module is __main__ in the process
 
 
 class TrackerProcesses:
