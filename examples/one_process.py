@@ -6,7 +6,6 @@ The same two services as in a fleet, without sockets and without child processes
 import sys
 import tempfile
 import threading
-import time
 from pathlib import Path
 
 import daedalus
@@ -15,7 +14,8 @@ from daedalus.actor.session.service import ActorService
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run.run_directory import SUMMARY, create, read_json
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec
-from daedalus.learner.service import LearnerService
+from daedalus.learner.service import LearnerService, Outputs
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -34,7 +34,8 @@ def learn(spec: RunSpec, directory: Path, network: MemoryNetwork, stop: threadin
     transport = MemoryTransport(network)
     progress = Progress(sys.stdout, spec.training.env_steps)
     try:
-        LearnerService(spec, directory, transport, stop, progress, [], started=time.monotonic()).run()
+        context = RunContext.begin(directory, spec, stop)
+        LearnerService(context, transport, Outputs(progress=progress)).run()
     finally:
         transport.close()
 

@@ -2,14 +2,12 @@
 
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.run.confirmation_file import ConfirmationFile
-from daedalus.learner.run.run_state import RunState
-from daedalus.learner.serving.events import EventLog
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.protocol.texts import exact_number, short_number
 
 if TYPE_CHECKING:
@@ -23,26 +21,14 @@ _logger = logging.getLogger(__name__)
 class TargetConfirmation:
     """The new episodes of one run, from the learner's side."""
 
-    def __init__(
-        self,
-        state: RunState,
-        events: EventLog,
-        stop: threading.Event,
-        *,
-        lock: threading.Condition,
-        beat: Callable[[], None],
-    ) -> None:
+    def __init__(self, context: RunContext, beat: Callable[[], None]) -> None:
         """Construct the confirmation.
 
         Args:
-          state: the target, and the counters, whose newest returns are forgotten when the target is not confirmed.
-          events: receives each target that was reached, and what came of it.
-          stop: event that ends the run, and the wait.
-          lock: guards the counters.
+          context: the run; its newest returns are forgotten when the target is not confirmed.
           beat: called again and again during the wait, to show that this process works.
         """
-        self._file, self._state = ConfirmationFile(state.directory), state
-        self._events, self._stop, self._lock, self._beat = events, stop, lock, beat
+        self._context, self._file, self._beat = context, ConfirmationFile(context.directory), beat
         self._not_before = -math.inf  # of the next attempt, on the monotonic clock
         self.result: dict[str, Any] | None = None  # of the new episodes that confirmed the target
 
@@ -57,13 +43,13 @@ class TargetConfirmation:
         began = time.monotonic()
         if began < self._not_before:
             return False
-        if not checkpointer.wait(checkpointer.begin(), self._stop, self._beat, patient=False):
-            return not self._stop.is_set()  # when a stopped run is resumed, it asks again
-        training = self._state.spec.training
+        if not checkpointer.wait(checkpointer.begin(), self._beat, patient=False):
+            return not self._context.stop.is_set()  # when a stopped run is resumed, it asks again
+        training = self._context.spec.training
         episodes = f"{training.target_episodes} new episodes"
         target = exact_number(training.target_return)
         text = f"target {target} reached: the policy of this moment plays {episodes} to confirm it"
-        self._events.add("target", text, cause=f"version {policy_version}")
+        self._context.events.add("target", text, cause=f"version {policy_version}")
         try:
             result = self._played_with(policy_version)
         except OSError as error:
@@ -73,26 +59,28 @@ class TargetConfirmation:
             return False
         if "failed" in result:  # such as a simulator of which only one runs at a time
             text = f"the target cannot be confirmed: {result['failed']}"
-            self._events.add("target", text, cause=f"result of version {policy_version}")
+            self._context.events.add("target", text, cause=f"result of version {policy_version}")
             return True
         if result["confirmed"]:
             self.result = result
             return True
-        with self._lock:
-            self._state.counters.forget_returns()
+        with self._context.lock:
+            self._context.counters.forget_returns()
         ended = time.monotonic()
         self._not_before = ended + (ended - began)
         text = f"not confirmed: return {short_number(result['return_mean'])}; training continues"
-        self._events.add("target", text, cause=f"result of version {policy_version}")
+        self._context.events.add("target", text, cause=f"result of version {policy_version}")
         return False
 
     def _played_with(self, policy_version: int) -> dict[str, Any] | None:
         """Return the launcher's result, or None if the run is stopped first. Raises OSError."""
         try:
             self._file.ask(policy_version)
-            while (result := self._file.answered(policy_version)) is None and not self._stop.wait(_POLL_SECONDS):
+            while (result := self._file.answered(policy_version)) is None and not self._context.stop.wait(
+                _POLL_SECONDS
+            ):
                 self._beat()
-                self._state.health.updated = time.monotonic()  # it works, although it does not train
+                self._context.health.updated = time.monotonic()  # it works, although it does not train
             return result
         finally:
             self._file.clear()

@@ -2,16 +2,14 @@
 
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Sequence
 
-from daedalus.learner.reporting.run_reporter import RunRecords
-from daedalus.learner.run.run_state import RunState
+from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.evaluations import EvaluationQueue, Evaluations
-from daedalus.learner.serving.query_responses import Orders
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
+from daedalus.learner.serving.waiting_requests import EvaluationQueue
 from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.learner.training.checkpointer import Checkpointer
 from daedalus.learner.training.learner import Learner
@@ -32,36 +30,36 @@ class EvaluationServer:
 
     def __init__(
         self,
+        context: RunContext,
         queue: EvaluationQueue,
-        evaluations: Evaluations,
         publisher: SnapshotPublisher,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`clock` returns the time on the monotonic clock, in seconds."""
-        self._queue, self._evaluations, self._publisher, self._clock = queue, evaluations, publisher, clock
+        self._context, self._queue, self._publisher, self._clock = context, queue, publisher, clock
+        self._evaluations = context.evaluations
         self._saved_at, self._took = -math.inf, 0.0  # the last save, and how long it kept the learner from training
 
-    def serve(self, learner: Learner, checkpointer: Checkpointer, env_steps: int) -> None:
+    def serve(self, learner: Learner, checkpointer: Checkpointer) -> None:
         """Answer all waiting reports, and the waiting requests if a save is due.
 
         Args:
           learner: has the newest policy.
           checkpointer: saves each policy that is handed out, because it may turn out to be the best.
-          env_steps: number of env_steps that the policy was trained on.
         """
         for request, report in self._queue.take_reports():
             self._evaluations.heard = self._clock()
-            answer, evaluated = self._evaluations.report(report)
+            answer, evaluated = self._evaluations.report(report, self._context.learner_epoch)
             request.reply(encode(answer))
             if evaluated is not None:
                 checkpointer.keep(evaluated)
         pause = _PAUSE_PER_SAVE * max(self._took, checkpointer.seconds)
         due = self._saved_at + min(max(pause, _MIN_SECONDS), _MAX_SECONDS)
         if checkpointer.idle and self._clock() >= due:
-            self._hand_out(learner, checkpointer, env_steps)
+            self._hand_out(learner, checkpointer)
 
-    def _hand_out(self, learner: Learner, checkpointer: Checkpointer, env_steps: int) -> None:
-        waiting = self._queue.take_requests()
+    def _hand_out(self, learner: Learner, checkpointer: Checkpointer) -> None:
+        waiting, env_steps = self._queue.take_requests(), self._context.counters.env_steps
         if not waiting:
             return
         began = self._clock()
@@ -72,7 +70,7 @@ class EvaluationServer:
             self._publisher.publish(version, learner.weights())
         for request, message in waiting:
             self._evaluations.begin(message.evaluator, saving.directory, version, env_steps)
-            request.reply(self._publisher.newest())
+            request.reply(self._publisher.snapshot())
         self._saved_at = self._evaluations.heard = self._clock()
         self._took = self._saved_at - began
 
@@ -82,63 +80,57 @@ class TrainingLoop:
 
     def __init__(
         self,
-        state: RunState,
+        context: RunContext,
         server: ActorServer,
         learner: Learner,
         checkpointer: Checkpointer,
-        *,
-        orders: Orders,
         confirmation: TargetConfirmation | None,
-        stop: threading.Event,
         beat: Callable[[], None],
     ) -> None:
         """Construct the loop.
 
         Args:
-          state: progress of the run.
-          server: source of the rollouts; publishes the policy.
+          context: progress of the run.
+          server: source of the rollouts and of the orders; publishes the policy.
           learner: makes the updates.
           checkpointer: saves them.
-          orders: of operators.
           confirmation: confirms that the target is reached; None: it needs no confirmation.
-          stop: event that ends the run.
           beat: called before each update, and while there is no batch.
         """
-        self._state, self._counters, self._health = state, state.counters, state.health
+        self._context, self._counters, self._health = context, context.counters, context.health
         self._server, self._learner, self._checkpointer = server, learner, checkpointer
-        self._orders, self._confirmation, self._stop, self._beat = orders, confirmation, stop, beat
-        self._evaluators = EvaluationServer(server.evaluations, state.evaluations, server.publisher)
+        self._orders, self._confirmation, self._beat = server.orders, confirmation, beat
+        self._evaluators = EvaluationServer(context, server.evaluations, server.publisher)
 
     def publish(self, program: bytes) -> None:
         """Offer the policy to the actors, before the first update."""
         learner = self._learner
         self._server.offer_policy(program, learner.state_size, learner.gradient_shapes)
-        if self._state.spec.uploads_gradients:
-            self._server.publisher.extras = lambda: learner.gradient_inputs(self._state.progress)
+        if self._context.spec.uploads_gradients:
+            self._server.publisher.extras = lambda: learner.gradient_inputs(self._context.progress)
         self._server.publisher.publish(learner.policy_version, learner.weights())
 
-    def run(self, records: RunRecords, *, resumed: bool) -> float:
+    def run(self, reporter: RunReporter) -> float:
         """Train until the target is reached, the budget is used or the stop event is set.
 
-        Return when training ended, on the monotonic clock: before the target was confirmed. `resumed` says that the run
-        continues from a checkpoint.
+        Return when training ended, on the monotonic clock: before the target was confirmed.
         """
-        training, service = self._state.spec.training, self._state.spec.service
+        training, service = self._context.spec.training, self._context.spec.service
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
         # A copy of the run directory must have a newer epoch than a learner that has resumed here: save its count soon.
-        soon_after = self._learner.policy_version if resumed else math.inf
-        while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
+        soon_after = self._learner.policy_version if self._context.starts > 1 else math.inf
+        while not self._context.stop.is_set() and self._counters.env_steps < training.env_steps:
             self._beat()
             self._update()
-            self._evaluators.serve(self._learner, self._checkpointer, self._counters.env_steps)
+            self._evaluators.serve(self._learner, self._checkpointer)
             now = time.monotonic()
             if self._reaches_target():
-                self._counters.seconds_to_target = self._state.wall_seconds(now)
+                self._counters.seconds_to_target = self._context.wall_seconds(now)
                 if training.stop_when_solved:
                     return now
             if now >= log_at:
-                records.record(self._learner, now)
+                reporter.record(self._learner, now)
                 log_at = now + service.log_seconds
             due = now >= save_at or self._orders.checkpoint_wanted or self._learner.policy_version > soon_after
             if due and self._checkpointer.idle:
@@ -150,7 +142,7 @@ class TrainingLoop:
 
     def _reaches_target(self) -> bool:
         """Return whether the target is reached for the first time, and new episodes confirm it if they are played."""
-        if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._state.spec):
+        if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._context.spec):
             return False
         confirmation, version = self._confirmation, self._learner.policy_version
         return confirmation is None or confirmation.confirm(version, self._checkpointer)
@@ -158,14 +150,14 @@ class TrainingLoop:
     def _update(self) -> None:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
         learner, rollouts = self._learner, self._server.rollouts
-        env_steps, progress = self._counters.env_steps, self._state.progress
+        env_steps, progress = self._counters.env_steps, self._context.progress
         batch = rollouts.take_batch(learner.policy_version)
         self._health.left_out = rollouts.left_out
         if not batch:
             return
         skipped = learner.updates_skipped
         left_out = self._learn_from(batch, progress)
-        learner.anneal_exploration(self._state.spec.training.exploration_annealing(progress, env_steps))
+        learner.anneal_exploration(self._context.spec.training.exploration_annealing(progress, env_steps))
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights, len(batch))
         rollouts.count_trained(batch, left_out, learner.far_outside)
         if learner.far_outside:

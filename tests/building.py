@@ -1,6 +1,9 @@
 """Builders for tests of the learner: small specifications, rollouts, batches, fleets."""
 
+import threading
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +12,7 @@ from plain import vector_spaces
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.protocol.messages import Join
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec, TrainingSpec
@@ -100,3 +104,11 @@ def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces 
         assert fleet.join(Join(actor=actor, incarnation=1, spaces=spaces, environments=environments), 0.0) is None
         fleet.set_present(actor, 1, True, 0.0)
     return fleet
+
+
+def run_context(
+    spec: RunSpec | None = None, directory: Path = Path("r"), *, spaces: Spaces | None = SPACES, **replaced: Any
+) -> RunContext:
+    """Return the context of a new run, with `EPOCH` and other parts if they are given."""
+    context = RunContext.begin(directory, spec or run_spec(), threading.Event(), spaces=spaces)
+    return replace(context, **{"learner_epoch": EPOCH, **replaced})

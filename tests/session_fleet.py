@@ -2,7 +2,6 @@
 
 import io
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,9 @@ from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.service import ActorService
 from daedalus.learner.reporting.progress import Progress
-from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.run.resuming import Beginning
+from daedalus.learner.service import LearnerService, Outcome, Outputs
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -117,15 +118,9 @@ class LearnerProcess(Worker):
     def _learn(self) -> Outcome:
         transport = MemoryTransport(self._network)
         try:
-            return LearnerService(
-                self._spec,
-                self._directory,
-                transport,
-                self.stop,
-                Progress(io.StringIO(), self._spec.training.env_steps),
-                [],
-                started=time.monotonic(),
-                restored=load_newest(self._directory) if self._resume else None,
-            ).run()
+            restored = load_newest(self._directory) if self._resume else None
+            context = RunContext.begin(self._directory, self._spec, self.stop, restored=restored)
+            outputs = Outputs(progress=Progress(io.StringIO(), self._spec.training.env_steps))
+            return LearnerService(context, transport, outputs, Beginning(restored=restored)).run()
         finally:
             transport.close()

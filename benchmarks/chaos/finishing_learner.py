@@ -17,7 +17,7 @@ if __name__ == "__main__":
 
     def use_up_budget(_number: int, _frame: object) -> None:
         for service in services:
-            service._state.counters.env_steps = service._spec.training.env_steps
+            service._context.counters.env_steps = service._context.spec.training.env_steps
 
     LearnerService.__init__ = noted  # type: ignore[method-assign] - only in this process
     signal.signal(signal.SIGUSR1, use_up_budget)

@@ -98,7 +98,7 @@ def main(
 def _record(result: dict[str, Any], directory: Path) -> bool:
     """Keep a result in a run directory, as the final evaluation does, and return whether that was possible."""
     from daedalus.cli.evaluation_processes import evaluation_summary
-    from daedalus.learner.run import run_directory  # other evaluations need no learner's code
+    from daedalus.learner.run import run_directory  # a policy of another place needs no code of the learner
     from daedalus.learner.run.settings import SettingsError
 
     path = directory / run_directory.EVALUATION

@@ -46,15 +46,22 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
 from daedalus.learner.reporting.recorder import OpenWriter
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
-from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
+from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.process_resources import keep_freed_memory, reserve_descriptors
-from daedalus.learner.run.resuming import CheckpointMismatchError, allows_other_spaces, finished_run, initial_to_resume
+from daedalus.learner.run.resuming import (
+    Beginning,
+    CheckpointMismatchError,
+    allows_other_spaces,
+    finished_run,
+    initial_to_resume,
+)
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.service import LearnerService, Outcome, Outputs
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings
@@ -189,7 +196,6 @@ class _Command:
         run = run if run.exists else self._with_directory(run, stack)
         try:
             service = self._service(run, transport, restored, initial, spaces)
-            self.context["epoch"] = f"{service.learner_epoch:x}"
             announce(run, arguments, self.credentials)
             if arguments.prepared is None:  # else the launcher starts them
                 output = stack.enter_context(
@@ -227,24 +233,23 @@ class _Command:
         initial: SavedPolicy | None,
         spaces: Spaces | None,
     ) -> LearnerService:
-        return LearnerService(
-            run.spec,
-            run.directory,
-            transport,
-            self.stop,
-            self.progress,
-            _writers(run.directory, self.arguments.rows_to),
-            started=self.started,
+        arguments = self.arguments
+        context = RunContext.begin(
+            run.directory, run.spec, self.stop, started=self.started, spaces=spaces, restored=restored
+        )
+        context.health.certificate_days_left = partial(certificate_days_left, self.credentials)
+        beginning = Beginning(
             restored=restored,
             initial=initial,
-            other_spaces=self.arguments.allow_other_spaces or allows_other_spaces(run.directory),
-            spaces=spaces,
+            allows_other_spaces=arguments.allow_other_spaces or allows_other_spaces(run.directory),
+            reset_statistics=arguments.reset_statistics,
             modules=run.modules,
-            certificate_days_left=partial(certificate_days_left, self.credentials),
-            user_metrics=self.user_metrics,
-            confirms=self.arguments.confirm or (self.arguments.prepared is None and _confirms(run.spec)),
-            reset_statistics=self.arguments.reset_statistics,
         )
+        writers = _writers(run.directory, arguments.rows_to)
+        outputs = Outputs(progress=self.progress, writers=writers, user_metrics=self.user_metrics)
+        self.context["epoch"] = f"{context.learner_epoch:x}"
+        confirms = arguments.confirm or (arguments.prepared is None and _confirms(run.spec))
+        return LearnerService(context, transport, outputs, beginning, confirms=confirms)
 
 
 def _with_spaces(

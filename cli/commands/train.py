@@ -42,7 +42,7 @@ from daedalus.cli.settings_arguments import (
 )
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.training_display import TrainingDisplay
-from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
+from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.resuming import FinishedRun, check_initial, finished_run, initial_to_resume, with_changes
 from daedalus.learner.run.run_lock import RunInUseError, RunLock

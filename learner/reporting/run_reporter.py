@@ -1,8 +1,7 @@
-"""Metrics rows, status and summary of one run, from its counters, fleet and health."""
+"""Metrics rows, status and summary of one run, from its counters, fleet and health, and their files."""
 
 import logging
 import math
-import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,24 +10,26 @@ import numpy as np
 
 from daedalus.learner.reporting.csv_writer import cut_rows
 from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint
-from daedalus.learner.reporting.metrics_rows import ENV, Details, MetricsHistory, read_rows
+from daedalus.learner.reporting.metrics_rows import ENV, Details, read_rows
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.health import Health
 from daedalus.learner.run.run_directory import EVALUATION, METRICS, SUMMARY, read_json, write_json
-from daedalus.learner.run.run_state import RunState
 from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.serving.events import RESUMED, EventLog
+from daedalus.learner.serving.events import RESUMED
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import page, totals
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.policy.saving.best_checkpoints import set_aside_newer
 from daedalus.protocol.messages import RunStatus
-from daedalus.protocol.spec import RunSpec
 
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
+
+_DETAILS_SECONDS = 10.0  # between details: they take far more space than a row
+
+_logger = logging.getLogger(__name__)
 
 
 def episode_statistics(counters: RunCounters) -> dict[str, float]:
@@ -42,116 +43,6 @@ def episode_statistics(counters: RunCounters) -> dict[str, float]:
         "episode_return_min": float(returns.min()),
         "episode_return_max": float(returns.max()),
         "episode_length_mean": float(np.mean(counters.lengths)),
-    }
-
-
-def metrics_row(
-    counters: RunCounters,
-    fleet: Fleet,
-    rates: dict[str, float],
-    learning: dict[str, float],
-    wall_seconds: float,
-) -> dict[str, float]:
-    """Return one metrics row, with columns of learner/reporting/metrics_rows.py and the scalars of the environment.
-
-    Args:
-      counters: counters of the run.
-      fleet: the actors.
-      rates: result of `RateMeter.measure`.
-      learning: metrics of the updates and of the newest evaluation.
-      wall_seconds: duration of the run.
-    """
-    return {
-        "wall_seconds": wall_seconds,
-        "env_steps": counters.env_steps,
-        "updates": counters.updates,
-        "episodes": counters.episodes,
-        **episode_statistics(counters),
-        **rates,
-        "policy_lag_max": counters.policy_lag_max,
-        "actors": len(fleet.live),
-        "rollouts_accepted": counters.rollouts_accepted,
-        "rollouts_rejected": counters.rollouts_rejected.total(),
-        "updates_skipped": counters.updates_skipped,
-        **learning,
-        **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
-    }
-
-
-def run_status(
-    run: str,
-    learner_epoch: int,
-    spec: RunSpec,
-    counters: RunCounters,
-    fleet: Fleet,
-    rates: dict[str, float],
-    health: Health,
-    queue_bytes: int,
-    now: float,
-) -> RunStatus:
-    """Return the status of the run with its first actors. `now` is on the monotonic clock, in seconds."""
-    fleet.forget_absent(now)
-    return RunStatus(
-        run=run,
-        learner_epoch=learner_epoch,
-        algorithm=spec.training.algorithm,
-        environment=spec.environment.id,
-        problems=health.problems(now, len(fleet.live)),
-        uptime_seconds=now - health.started,
-        env_steps=counters.env_steps,
-        env_steps_budget=spec.training.env_steps,
-        updates=counters.updates,
-        updates_skipped=counters.updates_skipped,
-        episode_return_mean=counters.episode_return_mean,
-        env_steps_per_second=rates.get("env_steps_per_second", 0.0),
-        updates_per_second=rates.get("updates_per_second", 0.0),
-        policy_lag_mean=rates.get("policy_lag_mean", 0.0),
-        queue_bytes=queue_bytes,
-        queue_bytes_limit=spec.service.queue_bytes,
-        checkpoint_age_seconds=None if health.saved is None else now - health.saved,
-        certificate_days_left=health.certificate_days_left(),
-        rollouts_accepted=counters.rollouts_accepted,
-        rollouts_rejected=dict(counters.rollouts_rejected),
-        **totals(fleet),
-        refused_joins=fleet.refused_joins.report(now),
-        actors=page(fleet, "", now),
-    )
-
-
-def summary(
-    run: str,
-    spec: RunSpec,
-    counters: RunCounters,
-    *,
-    finished: bool,
-    wall_seconds: float,
-    env_steps_per_second: float,
-) -> dict[str, Any]:
-    """Return the content of summary.json at the end of training. A final evaluation adds its results later."""
-    return {
-        "run": run,
-        "algorithm": spec.training.algorithm,
-        "environment": spec.environment.id,
-        "seed": spec.training.seed,
-        "solved": counters.seconds_to_target is not None,
-        "finished": finished,
-        "env_steps": counters.env_steps,
-        "updates": counters.updates,
-        "updates_skipped": counters.updates_skipped,
-        "episodes": counters.episodes,
-        "wall_seconds": wall_seconds,
-        "seconds_to_target": counters.seconds_to_target,
-        "env_steps_per_second": env_steps_per_second,
-        "episode_return_mean": counters.episode_return_mean,
-        "evaluation_return_mean": None,
-        "evaluation_return_std": None,
-        "confirmation_return_mean": None,
-        "policy_lag_mean": counters.policy_lag_mean,
-        "policy_lag_max": counters.policy_lag_max,
-        "rollouts_accepted": counters.rollouts_accepted,
-        "rollouts_rejected": dict(counters.rollouts_rejected),
-        "rollout_bytes_per_env_step": counters.rollout_bytes / max(counters.accepted_env_steps, 1),
-        "snapshots_published": counters.snapshots_published,
     }
 
 
@@ -202,58 +93,88 @@ class RateMeter:
         return self.rates
 
 
-_DETAILS_SECONDS = 10.0  # between details: they take far more space than a row
-
-
 class RunReporter:
-    """Reporter of one run. Reads the counters and the fleet under their lock. No I/O."""
+    """Reporter of one run: its status, and during training, from `begin` to `close`, its metrics rows and summary.
 
-    def __init__(self, state: RunState, fleet: Fleet, lock: threading.Condition, user_metrics: UserMetrics) -> None:
-        """Construct the reporter. `lock` guards the counters and the fleet."""
-        self._state, self._counters, self._fleet, self._lock = state, state.counters, fleet, lock
-        self._user_metrics = user_metrics
+    It reads the counters and the fleet under their lock. A disk error is logged and does not end the run.
+    """
+
+    def __init__(self, context: RunContext, user_metrics: UserMetrics) -> None:
+        self._context, self._counters, self._user_metrics = context, context.counters, user_metrics
+        self._recorder: Recorder | None = None  # None: training has not begun
         self._details_at = -math.inf  # when the next details are due
-        training = state.spec.training
-        self._meter = RateMeter(self._counters, state.health.started)
+        training = context.spec.training
+        self._meter = RateMeter(self._counters, context.health.started)
         self._episode_hint = EpisodeHint(training.env_steps)
         self._learning_hint = LearningHint(training.env_steps, normalizes_rewards=training.normalize_rewards)
 
-    def begin(self, now: float) -> None:
-        """Start to measure rates, at the begin of training."""
+    def begin(self, recorder: Recorder, now: float) -> None:
+        """Start to measure rates, at the start of training. The recorder is closed with the reporter."""
+        self._recorder, health = recorder, self._context.health
         self._meter = RateMeter(self._counters, now)
-        self._state.health.updated = self._state.health.actor_seen = now
+        health.updated = health.actor_seen = now
+        health.recording_since = lambda: recorder.busy_since
+
+    def record(self, learner: "Learner", now: float, *, last: bool = False) -> None:
+        """Record a row of metrics, and log a hint if one is due. `last` marks the row of a stop."""
+        assert self._recorder is not None
+        row = self.row(learner, now, last=last)
+        self._context.history.add(row)
+        self._recorder.record(row, self._details(learner, now, last=last))
+        if not last and (hint := self._hint()):
+            _logger.warning("%s", hint)
+
+    def close(self) -> None:
+        """Write the queued rows."""
+        assert self._recorder is not None
+        self._recorder.close()
 
     def row(self, learner: "Learner", now: float, *, last: bool = False) -> dict[str, float]:
-        """Return a metrics row, with rates and means since the previous row. `last` marks that of a stop."""
+        """Return a metrics row: columns of metrics_rows.py, and the scalars of the environment and of the program.
+
+        Rates and means are since the previous row. `last` marks the row of a stop.
+        """
         learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
-        with self._lock:
-            progress = self._state.progress
-            rates = self._meter.measure(self._counters, self._fleet, now, last=last)
-            if self._fleet.live:
-                self._state.health.actor_seen = now
-            learning = {
+        context, counters, fleet = self._context, self._counters, self._context.fleet
+        with context.lock:
+            progress = context.progress
+            rates = self._meter.measure(counters, fleet, now, last=last)
+            if fleet.live:
+                context.health.actor_seen = now
+            row = {
+                "wall_seconds": context.wall_seconds(now),
+                "env_steps": counters.env_steps,
+                "updates": counters.updates,
+                "episodes": counters.episodes,
+                **episode_statistics(counters),
+                **rates,
+                "policy_lag_max": counters.policy_lag_max,
+                "actors": len(fleet.live),
+                "rollouts_accepted": counters.rollouts_accepted,
+                "rollouts_rejected": counters.rollouts_rejected.total(),
+                "updates_skipped": counters.updates_skipped,
                 **learned,
-                **self._state.evaluations.take_newest(),
+                **context.evaluations.take_newest(),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
                 **self._user_metrics.take(),
+                **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
             }
-            row = metrics_row(self._counters, self._fleet, rates, learning, self._state.wall_seconds(now))
         self._learning_hint.add(row)
         return row
 
-    def hint(self) -> str:
+    def _hint(self) -> str:
         """Return a hint for the user if one is due, else an empty string."""
-        with self._lock:
-            hint = self._episode_hint.take(self._counters, self._fleet)
+        with self._context.lock:
+            hint = self._episode_hint.take(self._counters, self._context.fleet)
         return hint or self._learning_hint.take()
 
-    def details(self, learner: "Learner", now: float, *, last: bool = False) -> Details:
+    def _details(self, learner: "Learner", now: float, *, last: bool = False) -> Details:
         """Return the distributions and the picture that belong to a metrics row; most rows have none."""
         if now < self._details_at and not last:
             return Details()
         self._details_at = now + _DETAILS_SECONDS
-        with self._lock:
+        with self._context.lock:
             returns, lengths = list(self._counters.returns), list(self._counters.lengths)
         return Details(
             returns=returns,
@@ -263,61 +184,72 @@ class RunReporter:
         )
 
     def status(self, queue_bytes: int, now: float) -> RunStatus:
-        """Return the answer to a status query. The caller holds the lock."""
-        return run_status(
-            self._state.name,
-            self._state.learner_epoch,
-            self._state.spec,
-            self._counters,
-            self._fleet,
-            self._meter.rates,
-            self._state.health,
-            queue_bytes,
-            now,
+        """Return the status of the run with its first actors. The caller holds the lock.
+
+        Args:
+          queue_bytes: size of the rollouts that wait.
+          now: time on the monotonic clock, in seconds.
+        """
+        context, spec, counters, fleet = self._context, self._context.spec, self._counters, self._context.fleet
+        rates, health = self._meter.rates, context.health
+        fleet.forget_absent(now)
+        return RunStatus(
+            run=context.name,
+            learner_epoch=context.learner_epoch,
+            algorithm=spec.training.algorithm,
+            environment=spec.environment.id,
+            problems=health.problems(now, len(fleet.live)),
+            uptime_seconds=now - health.started,
+            env_steps=counters.env_steps,
+            env_steps_budget=spec.training.env_steps,
+            updates=counters.updates,
+            updates_skipped=counters.updates_skipped,
+            episode_return_mean=counters.episode_return_mean,
+            env_steps_per_second=rates.get("env_steps_per_second", 0.0),
+            updates_per_second=rates.get("updates_per_second", 0.0),
+            policy_lag_mean=rates.get("policy_lag_mean", 0.0),
+            queue_bytes=queue_bytes,
+            queue_bytes_limit=spec.service.queue_bytes,
+            checkpoint_age_seconds=None if health.saved is None else now - health.saved,
+            certificate_days_left=health.certificate_days_left(),
+            rollouts_accepted=counters.rollouts_accepted,
+            rollouts_rejected=dict(counters.rollouts_rejected),
+            **totals(fleet),
+            refused_joins=fleet.refused_joins.report(now),
+            actors=page(fleet, "", now),
         )
 
     def summary(self, *, finished: bool, now: float) -> dict[str, Any]:
-        """Return the content of summary.json. Its env_steps_per_second is over the training of this process."""
-        return summary(
-            self._state.name,
-            self._state.spec,
-            self._counters,
-            finished=finished,
-            wall_seconds=self._state.wall_seconds(now),
-            env_steps_per_second=self._meter.overall(self._counters, now),
-        )
+        """Return the content of summary.json at the end of training. A final evaluation adds its results later.
 
-
-_logger = logging.getLogger(__name__)
-
-
-class RunRecords:
-    """Writer of the records of one run during training, from construction to `close`."""
-
-    def __init__(self, state: RunState, reporter: RunReporter, history: MetricsHistory, recorder: Recorder) -> None:
-        """Construct the writer.
-
-        Args:
-          state: names the directory.
-          reporter: source of the rows and of the summary.
-          history: receives each row, for operators who watch the run.
-          recorder: writes the rows; it is closed with the records.
+        Its env_steps_per_second is over the training of this process.
         """
-        self._directory, self._reporter = state.directory, reporter
-        self._history, self._recorder = history, recorder
-        state.health.recording_since = lambda: recorder.busy_since
-
-    def record(self, learner: "Learner", now: float, *, last: bool = False) -> None:
-        """Record a row of metrics, and log a hint if one is due. `last` marks the row of a stop."""
-        row = self._reporter.row(learner, now, last=last)
-        self._history.add(row)
-        self._recorder.record(row, self._reporter.details(learner, now, last=last))
-        if not last and (hint := self._reporter.hint()):
-            _logger.warning("%s", hint)
-
-    def close(self) -> None:
-        """Write the queued rows."""
-        self._recorder.close()
+        spec, counters = self._context.spec, self._counters
+        return {
+            "run": self._context.name,
+            "algorithm": spec.training.algorithm,
+            "environment": spec.environment.id,
+            "seed": spec.training.seed,
+            "solved": counters.seconds_to_target is not None,
+            "finished": finished,
+            "env_steps": counters.env_steps,
+            "updates": counters.updates,
+            "updates_skipped": counters.updates_skipped,
+            "episodes": counters.episodes,
+            "wall_seconds": self._context.wall_seconds(now),
+            "seconds_to_target": counters.seconds_to_target,
+            "env_steps_per_second": self._meter.overall(counters, now),
+            "episode_return_mean": counters.episode_return_mean,
+            "evaluation_return_mean": None,
+            "evaluation_return_std": None,
+            "confirmation_return_mean": None,
+            "policy_lag_mean": counters.policy_lag_mean,
+            "policy_lag_max": counters.policy_lag_max,
+            "rollouts_accepted": counters.rollouts_accepted,
+            "rollouts_rejected": dict(counters.rollouts_rejected),
+            "rollout_bytes_per_env_step": counters.rollout_bytes / max(counters.accepted_env_steps, 1),
+            "snapshots_published": counters.snapshots_published,
+        }
 
     def write_summary(self, *, finished: bool, ended: float, confirmation: dict[str, Any] | None) -> None:
         """Write summary.json.
@@ -327,39 +259,39 @@ class RunRecords:
           ended: when training ended, on the monotonic clock, in seconds.
           confirmation: result of the new episodes that confirmed the target; None without them.
         """
-        content = self._reporter.summary(finished=finished, now=ended)
+        content = self.summary(finished=finished, now=ended)
         if confirmation is not None:
             content["confirmation"] = confirmation
             content["confirmation_return_mean"] = confirmation["return_mean"]
         try:
-            write_json(self._directory / SUMMARY, content)
+            write_json(self._context.directory / SUMMARY, content)
         except OSError as error:
             _logger.warning("summary not written: %s", error.strerror)
 
 
-def continue_records(state: RunState, policy_version: int, history: MetricsHistory, events: EventLog) -> None:
-    """Undo what the learner processes before recorded after the checkpoint of this policy version; read the rest.
+def continue_records(context: RunContext) -> None:
+    """Undo what the learner processes before recorded after the checkpoint; read the rest.
 
     Rows of the metrics and best checkpoints of env_steps that the run makes again would be those of other weights.
     Scores of episodes with another environment.max_episode_steps are no longer comparable.
     """
-    directory, env_steps = state.directory, state.counters.env_steps
+    directory, env_steps, policy_version = context.directory, context.counters.env_steps, context.start_version
     try:
         rows = cut_rows(directory / METRICS, env_steps)
         if rows:
             writer = TensorBoardWriter(directory)
             writer.purge(env_steps)
             writer.close()
-            state.evaluations.carry_over(rows)
+            context.evaluations.carry_over(rows)
         undone = [f"{len(rows):,} rows of {METRICS}"] if rows else []
-        comparable = -1 if state.other_episodes else policy_version  # the highest version whose score is
+        comparable = -1 if context.other_episodes else policy_version  # the highest version whose score is
         undone += [f"{each.name}, whose policy is kept" for each in set_aside_newer(directory, comparable)]
         undone += _remove_later_results(directory, env_steps, policy_version)
         if undone:
             text = f"continues at {env_steps:,} env_steps: undone are {', '.join(undone)}"
-            events.add("checkpoint", f"{RESUMED}{text}")
+            context.events.add("checkpoint", f"{RESUMED}{text}")
         for row in read_rows(directory / METRICS):
-            history.add(row)
+            context.history.add(row)
     except FileNotFoundError:
         return  # no row yet
     except (OSError, ValueError) as error:

@@ -3,20 +3,28 @@
 Without torch, so that a command can import it early.
 """
 
+import logging
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.run.counters import RunCounters, check_counters
 from daedalus.learner.run.run_directory import SUMMARY, VERSIONS, read_json
 from daedalus.learner.run.settings import SettingsError, override, run_spec
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
 from daedalus.protocol.texts import exact_number
+
+if TYPE_CHECKING:
+    from daedalus.learner.training.checkpoint import Checkpoint
+    from daedalus.learner.training.learner import Learner
+
+_logger = logging.getLogger(__name__)
 
 # They define what is learned, and by what: the weights, the statistics of the optimiser and the results so far belong
 # to them.
@@ -229,3 +237,60 @@ def _newest_counters(directory: Path, spec: RunSpec) -> RunCounters | None:
 
 class CheckpointMismatchError(Exception):
     """Error for a checkpoint of another network or optimiser."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Beginning:
+    """What the policy of a learner process begins with: a checkpoint, the weights of another run, or neither."""
+
+    restored: "Checkpoint | None" = None
+    initial: SavedPolicy | None = None  # policy of another run, without a checkpoint to continue from
+    allows_other_spaces: bool = False  # whether the spaces of `initial` may be others than those of this run
+    reset_statistics: bool = False  # whether to forget the running statistics of the checkpoint
+    modules: UserModules = NO_MODULES  # that may be imported for the policy
+
+    def load_into(self, learner: "Learner", spec: RunSpec, progress: float) -> None:
+        """Give a learner its first weights. Raises CheckpointMismatchError.
+
+        Args:
+          learner: at policy version 0.
+          spec: specification of the run.
+          progress: of the annealed settings, from 0 to 1.
+        """
+        if self.restored is not None:
+            policy = self.restored.policy
+            if difference := other_network(policy, spec.policy, learner.spaces):
+                raise CheckpointMismatchError(f"{policy.directory}: {difference}")
+            learner.restore(policy.policy_version, policy.weights, self.restored.state)
+            if self.reset_statistics:
+                learner.reset_statistics()
+                _logger.info("statistics of observations and rewards reset: the next rollouts define them")
+            if learner.learning_rate(progress) == 0.0:
+                _logger.warning(
+                    "the learning rate has been annealed to 0: the policy changes no more; "
+                    "start a new run from its weights, with --init-from"
+                )
+        elif self.initial is not None:
+            try:
+                self._check_initial(self.initial, spec, learner.spaces)
+                learner.load(self.initial.weights)
+            except CheckpointMismatchError as error:
+                raise CheckpointMismatchError(f"--init-from {self.initial.directory}: {error}") from None
+            version, directory = self.initial.policy_version, self.initial.directory
+            _logger.info("initial weights: policy version %d of %s", version, directory)
+
+    def _check_initial(self, initial: SavedPolicy, spec: RunSpec, spaces: Spaces) -> None:
+        """Raise CheckpointMismatchError if the policy of another run means something else in this one."""
+        if difference := other_network(initial, spec.policy, spaces):
+            raise CheckpointMismatchError(difference)
+        difference = other_spaces(initial, spec.environment, spaces)
+        if difference and not self.allows_other_spaces:
+            raise CheckpointMismatchError(
+                f"its policy is for other spaces: {difference}; name a run of the same spaces, or add "
+                "--allow-other-spaces (in Python: allow_other_spaces=True) to load its weights if all shapes fit"
+            )
+        if difference:
+            _logger.warning("initial weights of other spaces (--allow-other-spaces): %s", difference)
+
+
+NO_WEIGHTS = Beginning()

@@ -1,111 +1,21 @@
-"""Evaluations: messages of evaluators that wait for the learner's thread, what is in progress, and its results.
+"""Evaluations in progress and their results. State; no threads, no network.
 
 The checkpoint of a policy is kept while an evaluator plays the policy. The best checkpoints are kept permanently.
 """
 
 import math
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.query_responses import read_request
 from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol import keys
-from daedalus.protocol.codec import encode
-from daedalus.protocol.limits import EVALUATION_LIMITS
-from daedalus.protocol.messages import Acknowledgement, EvaluationReport, EvaluationRequest, Refusal
+from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 from daedalus.protocol.texts import short_number
 from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER
-from daedalus.transport.interface import Request
-
-_MAX_WAITING = 64  # requests, and as many reports
-
-_M = TypeVar("_M")
-
-
-class EvaluationQueue:
-    """Bounded queue of messages on the `evaluations` keys. Accepts messages from `open` to `end`.
-
-    It holds at most one request and one report of each evaluator: a newer message replaces the older one.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        # By evaluator, the oldest first.
-        self._requests: dict[str, tuple[Request, EvaluationRequest]] = {}
-        self._reports: dict[str, tuple[Request, EvaluationReport]] = {}
-        self._ready = False
-        self._ending: Refusal | None = None  # of all messages after the end
-
-    def open(self) -> None:
-        """Accept messages from now on. Called when there is a policy to evaluate."""
-        self._ready = True
-
-    def end(self, reason: str, *, finished: bool) -> None:
-        """Refuse all waiting and all later messages, with `reason`."""
-        ending = Refusal(code="finished" if finished else "not_ready", reason=reason)
-        with self._lock:
-            self._ending = ending
-        for request, _ in [*self.take_requests(), *self.take_reports()]:
-            request.reply(encode(ending))
-
-    def offer(self, request: Request) -> None:
-        """Queue a message of an evaluator, or refuse it. Does not block."""
-        sender = keys.last_chunk(request.key)
-        message = read_request(request.payload, EVALUATION_LIMITS, EvaluationRequest, EvaluationReport)
-        if not isinstance(message, Refusal) and message.evaluator != sender:
-            message = Refusal(code="malformed", reason=f"the message is not from evaluator {sender[:64]!r}")
-        if isinstance(message, Refusal):
-            request.reply(encode(message))
-            return
-        with self._lock:
-            if self._ending is not None:
-                refused, refusal = request, self._ending
-            elif not self._ready:
-                refused, refusal = request, _refusal("no evaluation is possible now")
-            elif isinstance(message, EvaluationRequest):
-                refused = _put(self._requests, sender, (request, message))
-                refusal = _refusal("a newer request took its place")
-            else:
-                refused = _put(self._reports, sender, (request, message))
-                refusal = _refusal("a newer report took its place")
-        if refused is not None:
-            refused.reply(encode(refusal))
-
-    def take_requests(self) -> list[tuple[Request, EvaluationRequest]]:
-        """Return the waiting requests for a policy. The caller replies to each."""
-        with self._lock:
-            taken, self._requests = self._requests, {}
-        return list(taken.values())
-
-    def take_reports(self) -> list[tuple[Request, EvaluationReport]]:
-        """Return the waiting reports. The caller replies to each."""
-        with self._lock:
-            taken, self._reports = self._reports, {}
-        return list(taken.values())
-
-
-def _refusal(reason: str) -> Refusal:
-    return Refusal(code="not_ready", reason=reason)
-
-
-def _put(waiting: dict[str, tuple[Request, _M]], sender: str, entry: tuple[Request, _M]) -> Request | None:
-    """Add a message of `sender`, and return the request that it displaces, if any.
-
-    At capacity it displaces the oldest of the owner with the most, so that nobody fills the queue for the others.
-    """
-    displaced = sender if sender in waiting else None
-    if displaced is None and len(waiting) >= _MAX_WAITING:
-        displaced = keys.first_of_largest_owner(waiting)
-    request = waiting.pop(displaced)[0] if displaced is not None else None
-    waiting[sender] = entry
-    return request
-
 
 _MAX_IN_PROGRESS = 16
 
@@ -132,7 +42,6 @@ class Evaluated:
 class Evaluations:
     """Evaluations of one run during one learner epoch."""
 
-    learner_epoch: int
     counters: RunCounters
     # By evaluator: checkpoint directory, policy version, env_steps.
     in_progress: dict[str, tuple[Path, int, int]] = field(default_factory=dict)
@@ -160,9 +69,12 @@ class Evaluations:
             del self.in_progress[keys.first_of_largest_owner(self.in_progress)]
         self.in_progress[evaluator] = directory, policy_version, env_steps
 
-    def report(self, report: EvaluationReport) -> tuple[Acknowledgement, Evaluated | None]:
-        """Record an evaluation. Return the answer to the evaluator, and the result if the report is accepted."""
-        if report.learner_epoch != self.learner_epoch:
+    def report(self, report: EvaluationReport, learner_epoch: int) -> tuple[Acknowledgement, Evaluated | None]:
+        """Record an evaluation. Return the answer to the evaluator, and the result if the report is accepted.
+
+        `learner_epoch` is that of this process: an evaluation of a policy of another one is fenced.
+        """
+        if report.learner_epoch != learner_epoch:
             return Acknowledgement(verdict="fenced", reason="the report is for another learner epoch"), None
         directory, version, env_steps = self.in_progress.get(report.evaluator, (None, -1, 0))
         if directory is None or version != report.policy_version:

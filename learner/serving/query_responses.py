@@ -1,4 +1,4 @@
-"""Answers to queries for joins, the program and the newest snapshot.
+"""Answers to joins and reports of actors, and to operators: status, events, and the metrics of the whole run.
 
 State that several of the transport's threads read. It decides and encodes the answers; the caller sends them.
 """
@@ -6,16 +6,15 @@ State that several of the transport's threads read. It decides and encodes the a
 import heapq
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable
-from typing import TypedDict, TypeVar
+from typing import TypedDict
 
-from daedalus.learner.reporting.metrics_rows import MetricsHistory
-from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.learner.serving.run_context import RunContext
+from daedalus.learner.serving.waiting_requests import read_request
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
-from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS, STATUS_REQUEST_LIMITS, Limits
+from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS, STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import (
     PAGE_ACTORS,
     Acknowledgement,
@@ -31,31 +30,14 @@ from daedalus.protocol.messages import (
     Join,
     Message,
     MetricsRequest,
-    Order,
     Origin,
-    Program,
     Refusal,
     RunStatus,
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.transport.interface import Request
-
-Kind = TypeVar("Kind")
-
-
-def read_request(payload: bytes, limits: Limits, *kinds: type[Kind]) -> Kind | Refusal:
-    """Return the message of a query, or the Refusal of what is no message of these kinds."""
-    try:
-        message = decode(payload, limits)
-    except ProtocolError as error:
-        return Refusal(code="malformed", reason=str(error))
-    if not isinstance(message, kinds):
-        expected = " or ".join(kind.__name__ for kind in kinds)
-        return Refusal(code="malformed", reason=f"expected {expected}, and not {type(message).__name__}")
-    return message
 
 
 class FleetTotals(TypedDict):
@@ -126,131 +108,36 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
 class StatusResponses:
     """Answers to the queries for the status of one learner."""
 
-    def __init__(
-        self,
-        run: str,
-        learner_epoch: int,
-        status: Callable[[], RunStatus],
-        fleet: Fleet,
-        lock: threading.Condition,
-        events: EventLog,
-        history: MetricsHistory,
-    ) -> None:
-        """`status` returns the status with the first page of actors; it is called with `lock` held."""
-        self._run, self._epoch, self._status = run, learner_epoch, status
-        self._fleet, self._lock, self._events, self._history = fleet, lock, events, history
+    def __init__(self, context: RunContext, status: Callable[[], RunStatus]) -> None:
+        """`status` returns the status with the first page of actors; it is called with the lock held."""
+        self._context, self._status = context, status
 
     def answer(self, request: Request) -> Message:
         """Return the status, or what the payload requests."""
+        context, epoch = self._context, self._context.learner_epoch
         if not request.size:
-            with self._lock:
+            with context.lock:
                 return StatusReport(status=self._status())
         message = read_request(request.payload, STATUS_REQUEST_LIMITS, ActorsRequest, EventsRequest, MetricsRequest)
         match message:
             case ActorsRequest():
-                with self._lock:
-                    actors = page(self._fleet, message.after, time.monotonic())
-                return ActorsReport(page=ActorsPage(learner_epoch=self._epoch, actors=actors))
+                with context.lock:
+                    actors = page(context.fleet, message.after, time.monotonic())
+                return ActorsReport(page=ActorsPage(learner_epoch=epoch, actors=actors))
             case EventsRequest():
-                events = self._events.report()
-                return EventsReport(page=EventsPage(run=self._run, learner_epoch=self._epoch, events=events))
+                events = context.events.report()
+                return EventsReport(page=EventsPage(run=context.name, learner_epoch=epoch, events=events))
             case MetricsRequest():
-                return self._history.page(self._run, self._epoch, message.first)
+                return context.history.page(context.name, epoch, message.first)
             case Refusal():
                 return message
 
 
-_ANSWER_SECONDS = 3.0  # a gateway waits 5 s for its answer
-_MOST_WAITING = 16  # requests whose answers wait
-_LATER = "not saved yet: the events of the run say when the checkpoint is saved"
+class JoinResponses:
+    """Encoded answers to the Joins and the reports of actors."""
 
-
-class Orders:
-    """The orders that were not carried out yet.
-
-    A checkpoint is written beside training. The answer waits until it is saved, for a few seconds at most.
-    """
-
-    def __init__(self, stop: threading.Event) -> None:
-        """`stop` ends the run."""
-        self._stop, self._lock = stop, threading.Lock()
-        self._wanted = False
-        self._waiting: list[Request] = []
-        self.stopped = False  # whether an operator stopped the run
-        self.superseded_by: int | None = None  # epoch of a newer learner of the run, for which this one steps down
-
-    def give(self, order: Order, request: Request) -> None:
-        """Note an order, which is answered now or when it is carried out. Does not block."""
-        if order == "stop":
-            self.stopped = True
-            self._stop.set()
-            request.reply(encode(Acknowledgement(verdict="accepted")))
-            return
-        with self._lock:
-            self._wanted = True
-            waits = len(self._waiting) < _MOST_WAITING
-            if waits:
-                self._waiting.append(request)
-        if not waits:
-            _answer_later(request)
-            return
-        timer = threading.Timer(_ANSWER_SECONDS, _answer_later, [request])  # no effect if it is answered by then
-        timer.daemon = True
-        timer.start()
-
-    def step_down(self, newer: int) -> None:
-        """Stop the run here: a learner of it with a newer epoch answers."""
-        self.superseded_by = newer
-        self._stop.set()
-
-    @property
-    def checkpoint_wanted(self) -> bool:
-        """Whether a checkpoint was ordered that `take_checkpoint` has not returned."""
-        return self._wanted
-
-    def take_checkpoint(self) -> Callable[[bool, str], None]:
-        """Take the orders of a checkpoint. Return what answers them: with whether it is saved, and what came of it."""
-        with self._lock:
-            self._wanted, waiting, self._waiting = False, self._waiting, []
-
-        def answer(is_saved: bool, result: str) -> None:
-            accepted = Acknowledgement(verdict="accepted", reason=result)
-            message = encode(accepted if is_saved else Refusal(code="failed", reason=result))
-            for request in waiting:
-                request.reply(message)
-
-        return answer
-
-
-def _answer_later(request: Request) -> None:
-    request.reply(encode(Acknowledgement(verdict="accepted", reason=_LATER)))
-
-
-class QueryResponses:
-    """Encoded answers to queries that do not carry rollouts. `lock` guards the fleet."""
-
-    def __init__(
-        self,
-        run: str,
-        spec: ActorSpec,
-        learner_epoch: int,
-        start_version: int,
-        fleet: Fleet,
-        lock: threading.Condition,
-        events: EventLog,
-    ) -> None:
-        self._run = run
-        self._spec = spec
-        self._epoch = learner_epoch
-        self._start_version = start_version
-        self._fleet = fleet
-        self._lock = lock
-        self._events = events
-        # The answer to queries for the newest snapshot, and its version if it is a snapshot.
-        self._snapshot: tuple[bytes, int | None] = (_refuse("the learner has no policy yet"), None)
-        self._unchanged = _refuse("the actor holds the newest snapshot")
-        self._program: Program | None = None
-        self._encoded_program = b""
+    def __init__(self, context: RunContext) -> None:
+        self._context, self._spec = context, context.spec.for_actors()
         self._ending: Refusal | None = None  # of joins after the end
         self.preparing = ""  # an actor that asked for the specification, and makes its environments
         self.postponed_at = -math.inf  # the last time that an actor was refused which will ask again
@@ -263,29 +150,35 @@ class QueryResponses:
           data: the encoded message.
           now: time on the monotonic clock, in seconds.
         """
-        message = _read_join(name, data)
+        message, fleet = _read_join(name, data), self._context.fleet
         if isinstance(message, Join) and self._ending is not None:
             return encode(self._ending)
         origin = message.origin if isinstance(message, Join) else origin_of(data, JOIN_LIMITS)
-        with self._lock:
-            before = self._fleet.incarnation_number(name)
-            refusal = message if isinstance(message, Refusal) else self._fleet.join(message, now)
+        with self._context.lock:
+            before = fleet.incarnation_number(name)
+            refusal = message if isinstance(message, Refusal) else fleet.join(message, now)
             if refusal is None:
-                self._lock.notify_all()
+                self._context.lock.notify_all()
             else:
-                self._fleet.refused_joins.add(name, origin, refusal.reason, now)
+                fleet.refused_joins.add(name, origin, refusal.reason, now)
                 self.postponed_at = now if refusal.code == "name_taken" else self.postponed_at
-            seed, epsilon = self._fleet.seed_for(name, self._start_version), self._fleet.epsilon_for(name)
-            is_new = self._fleet.incarnation_number(name) != before
+            seed, epsilon = fleet.seed_for(name, self._context.start_version), fleet.epsilon_for(name)
+            is_new = fleet.incarnation_number(name) != before
         if refusal is not None:
             self.preparing = "" if self.preparing == name else self.preparing
             self._add_refusal(name, origin, refusal)
             return encode(refusal)
         if is_new and isinstance(message, Join) and message.spaces is not None:
             text = f"joined with {message.environments} environments{_where(origin)}"
-            self._events.add("joined", text, actor=name)
+            self._context.events.add("joined", text, actor=name)
         self.preparing = self.preparing or name
-        welcome = Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, epsilon=epsilon, spec=self._spec)
+        welcome = Welcome(
+            run=self._context.name,
+            learner_epoch=self._context.learner_epoch,
+            seed=seed,
+            epsilon=epsilon,
+            spec=self._spec,
+        )
         return encode(welcome)
 
     def report(self, name: str, data: bytes) -> bytes:
@@ -293,43 +186,22 @@ class QueryResponses:
         message = read_request(data, CLIENT_REPORT_LIMITS, ClientReport)
         if isinstance(message, Refusal):
             return encode(message)
-        with self._lock:
-            refusal = self._fleet.report(name, message)
+        with self._context.lock:
+            refusal = self._context.fleet.report(name, message)
         return encode(refusal or Acknowledgement(verdict="accepted"))
 
     def _add_refusal(self, name: str, origin: Origin, refusal: Refusal) -> None:
         kind: EventKind = "failed" if refusal.code == "failed" else "refused"
         level = logging.INFO if refusal.code == "name_taken" else logging.WARNING  # that actor asks again
         text = f"{kind}{_where(origin)}: {refusal.reason}"
-        self._events.add(kind, text, actor=name, cause=refusal.reason, level=level)
+        self._context.events.add(kind, text, actor=name, cause=refusal.reason, level=level)
 
-    def offer_program(self, program: Program) -> None:
-        """Set the run's program, the answer to later queries."""
-        self._encoded_program, self._program = encode(program), program
-
-    def program(self, program_hash: str) -> bytes:
-        """Return the answer to a query for the program with a hash, or for the current program (`*`)."""
-        if self._program is None or program_hash not in ("*", self._program.hash):
-            return encode(Refusal(code="unknown", reason=f"no program with hash {program_hash[:64]!r}"))
-        return self._encoded_program
-
-    def offer_snapshot(self, encoded: bytes, policy_version: int) -> None:
-        """Set the newest snapshot, as the bytes that were published. After `end` this has no effect."""
-        if self._ending is None:
-            self._snapshot = encoded, policy_version
-
-    def end(self, run_ended: bytes, *, finished: bool) -> None:
-        """Refuse later joins, and answer queries for snapshots with `run_ended`, an encoded RunEnded."""
+    def end(self, *, finished: bool) -> None:
+        """Refuse later joins."""
         if finished:
             self._ending = Refusal(code="finished", reason="the run is over")
         else:
             self._ending = Refusal(code="not_ready", reason="the learner is stopping")
-        self._snapshot = run_ended, None
-
-    def snapshot(self, held_version: int | None = None) -> bytes:
-        """Return the answer to a query for the newest snapshot by an actor that holds `held_version`."""
-        encoded, version = self._snapshot
-        return self._unchanged if version is not None and version == held_version else encoded
 
 
 def _read_join(name: str, data: bytes) -> Join | Refusal:
@@ -352,7 +224,3 @@ def _where(origin: Origin) -> str:
     """Return host and software for a person, or an empty text if both are unknown."""
     where = ", ".join(filter(None, (bounded_text(origin.host, MAX_NAME), bounded_text(origin.software, MAX_NAME))))
     return f" ({where})" if where else ""
-
-
-def _refuse(reason: str) -> bytes:
-    return encode(Refusal(code="not_ready", reason=reason))

@@ -21,11 +21,11 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 from types import MappingProxyType
 
-from daedalus.learner.run.counters import RunCounters, updates_of
-from daedalus.learner.serving.events import EventLog
-from daedalus.learner.serving.fleet import NON_FINITE, Actor, Fault, Fleet
+from daedalus.learner.run.counters import updates_of
+from daedalus.learner.serving.fleet import NON_FINITE, Actor, Fault
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge, acknowledgement
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.upload_checks import Shapes
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -162,35 +162,15 @@ _logger = logging.getLogger(__name__)
 class RolloutIntake:
     """Server of the `rollouts` keys, from `open` to `close`."""
 
-    def __init__(
-        self,
-        spec: RunSpec,
-        lock: threading.Condition,
-        fleet: Fleet,
-        counters: RunCounters,
-        published_version: Callable[[], int],
-        events: EventLog,
-        *,
-        learner_epoch: int,
-        start_version: int,
-    ) -> None:
-        """Construct the intake.
-
-        Args:
-          spec: specification of the run.
-          lock: the condition shared with the actor server.
-          fleet, counters: guarded by `lock`.
-          published_version: function that returns the newest published policy version.
-          events: receives rejections and quarantines.
-          learner_epoch: epoch of this learner process.
-          start_version: policy version of the checkpoint that the run continues from, else 0.
-        """
-        self._spec, self._lock, self._fleet, self._counters = spec, lock, fleet, counters
-        self._published_version, self._events = published_version, events
-        self._version = start_version  # rollouts of this version have a policy lag of 0
-        self._judge = RolloutJudge(spec, learner_epoch, fleet)
-        self._buffer = _buffer(spec, self._judge)
-        self._requests = RequestQueue(spec.service.queue_bytes, _most_requests(spec, live=0))
+    def __init__(self, context: RunContext, published_version: Callable[[], int]) -> None:
+        """Construct the intake. `published_version` returns the newest published policy version."""
+        self._published_version = published_version
+        self._spec, self._lock = context.spec, context.lock
+        self._fleet, self._counters, self._events = context.fleet, context.counters, context.events
+        self._version = context.start_version  # rollouts of this version have a policy lag of 0
+        self._judge = RolloutJudge(context.spec, context.learner_epoch, context.fleet)
+        self._buffer = _buffer(context.spec, self._judge)
+        self._requests = RequestQueue(context.spec.service.queue_bytes, _most_requests(context.spec, live=0))
         self._named: set[str] = set()  # actors that were logged as left out
         self._ending: Acknowledgement | None = None  # of all rollouts after the end
         self._held = HeldAnswers()  # of accepted rollouts, until the next batch is taken

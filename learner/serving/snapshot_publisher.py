@@ -6,19 +6,18 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.query_responses import QueryResponses, read_request
+from daedalus.learner.serving.run_context import RunContext
+from daedalus.learner.serving.waiting_requests import read_request
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import Bits, bfloat16, planes
 from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS, Limits
 from daedalus.protocol.messages import CompactSnapshot, Program, Refusal, Snapshot, SnapshotPart, SnapshotRequest
-from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request, Transport, TransportError
 
 # A part waits in the router until the reader's link is free. A part larger than the router's buffer for one reader
@@ -68,14 +67,12 @@ class CompactSnapshotCache:
                 self._make_room()
         prepared = self._prepared.pop((version, held), None)
         if prepared is None:
-            return encode(Refusal(code="unknown", reason="the snapshot is no longer available: request the newest"))
+            return _refusal("unknown", "the snapshot is no longer available: request the newest")
         self._prepared[version, held] = prepared
         prepared.requested_at = time.monotonic()
         parts = -(-len(prepared.encoded) // PART_BYTES)
         if request.part >= parts:
-            return encode(
-                Refusal(code="unknown", reason=f"part {request.part} does not exist: the snapshot has {parts} parts")
-            )
+            return _refusal("unknown", f"part {request.part} does not exist: the snapshot has {parts} parts")
         piece = prepared.encoded[request.part * PART_BYTES : (request.part + 1) * PART_BYTES]
         return encode(
             SnapshotPart(
@@ -169,7 +166,7 @@ class CompactSnapshotServer:
     def offer(self, request: Request, message: SnapshotRequest) -> None:
         """Queue a request and its decoded payload, or refuse it if the queue is full. Does not block."""
         if self._requests.qsize() >= _MAX_WAITING:
-            request.reply(encode(Refusal(code="not_ready", reason="too many requests for snapshots: retry later")))
+            request.reply(_refusal("not_ready", "too many requests for snapshots: retry later"))
         else:
             self._requests.put((request, message))
 
@@ -193,53 +190,46 @@ class SnapshotPublisher:
     One thread publishes; any thread may answer queries.
     """
 
-    def __init__(
-        self,
-        run: str,
-        spec: RunSpec,
-        transport: Transport,
-        responses: QueryResponses,
-        fleet: Fleet,
-        lock: threading.Condition,
-        counters: RunCounters,
-        *,
-        learner_epoch: int,
-        start_version: int,
-    ) -> None:
-        """Construct the publisher.
-
-        Args:
-          run: name of the run.
-          spec: specification of the run.
-          transport: the network.
-          responses: answers to queries, updated with each snapshot.
-          fleet: the actors; guarded by `lock`.
-          lock: the condition shared with the actor server.
-          counters: counters of the run.
-          learner_epoch: epoch of this learner process.
-          start_version: policy version of the checkpoint that the run continues from, else 0.
-        """
-        self._key, self._spec, self._epoch = keys.snapshots(run), spec, learner_epoch
-        self._transport, self._responses, self._counters = transport, responses, counters
-        self._fleet, self._lock = fleet, lock
-        self._compact = CompactSnapshotServer(learner_epoch, responses.snapshot, self._count_answer)
+    def __init__(self, context: RunContext, transport: Transport) -> None:
+        self._context, self._transport = context, transport
+        self._compact = CompactSnapshotServer(context.learner_epoch, self.snapshot, self._count_answer)
+        # The answer to queries for the newest snapshot, and its version if it is a snapshot.
+        self._snapshot: tuple[bytes, int | None] = (_refusal("not_ready", "the learner has no policy yet"), None)
+        self._unchanged = _refusal("not_ready", "the actor holds the newest snapshot")
+        self._program_hash, self._program = "", b""
+        self._ended = False
         self._unpublished_rollouts = 0  # trained on since the last snapshot
-        self._program_hash = ""
-        self.version = start_version  # the newest published version
+        self.version = context.start_version  # the newest published version
         self.extras: Callable[[], dict[str, np.ndarray]] = dict  # what snapshots carry besides the weights
 
     def open(self) -> None:
         """Start to answer requests for compact snapshots."""
         self._compact.open()
 
+    def end(self, run_ended: bytes) -> None:
+        """Answer queries for snapshots with `run_ended`, an encoded RunEnded, from now on."""
+        self._ended = True
+        self._snapshot = run_ended, None
+
     def close(self) -> None:
         """Stop to answer requests for compact snapshots."""
         self._compact.close()
 
+    def program(self, name: str) -> bytes:
+        """Return the answer to a query for the program with a hash, or for the current program (`*`)."""
+        if not self._program or name not in ("*", self._program_hash):
+            return _refusal("unknown", f"no program with hash {name[:64]!r}")
+        return self._program
+
+    def snapshot(self, held_version: int | None = None) -> bytes:
+        """Return the answer to a query for the newest snapshot by an actor that holds `held_version`."""
+        encoded, version = self._snapshot
+        return self._unchanged if version is not None and version == held_version else encoded
+
     def answer(self, request: Request) -> None:
         """Answer a query on `snapshots`, or queue it if it requests a compact snapshot. Does not block."""
         if not request.size:
-            request.reply(self._responses.snapshot())
+            request.reply(self.snapshot())
             return
         message = read_request(request.payload, SNAPSHOT_REQUEST_LIMITS, SnapshotRequest)
         if isinstance(message, Refusal):
@@ -247,14 +237,14 @@ class SnapshotPublisher:
         elif message.compact:
             self._compact.offer(request, message)
         else:
-            answer = self._responses.snapshot(message.held_version)
+            answer = self.snapshot(message.held_version)
             request.reply(answer)
             self._count_answer(message, len(answer))
 
     def offer_program(self, model: bytes) -> None:
         """Make the policy program available to queries."""
         self._program_hash = program_hash(model)
-        self._responses.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
+        self._program = encode(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
 
     def publish_if_due(self, policy_version: int, weights: Callable[[], dict[str, np.ndarray]], rollouts: int) -> None:
         """Publish a policy version if enough rollouts were trained on since the last snapshot.
@@ -269,40 +259,38 @@ class SnapshotPublisher:
           rollouts: number of rollouts in the batch that made the version.
         """
         self._unpublished_rollouts += rollouts
-        with self._lock:
-            live = len(self._fleet.live)
-        version_due = 4 * (policy_version - self.version) >= self._spec.policy_lag_bound_with(live)
-        if self._spec.algorithm.synchronous or version_due or 4 * self._unpublished_rollouts >= live:
+        with self._context.lock:
+            live = len(self._context.fleet.live)
+        version_due = 4 * (policy_version - self.version) >= self._context.spec.policy_lag_bound_with(live)
+        if self._context.spec.algorithm.synchronous or version_due or 4 * self._unpublished_rollouts >= live:
             self.publish(policy_version, weights())
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
         """Publish a snapshot. It is encoded once, for subscribers and for queries."""
         snapshot = encode(
             Snapshot(
-                learner_epoch=self._epoch,
+                learner_epoch=self._context.learner_epoch,
                 policy_version=policy_version,
                 program=self._program_hash,
                 weights={**weights, **self.extras()},
             )
         )
-        self._responses.offer_snapshot(snapshot, policy_version)
+        if not self._ended:
+            self._snapshot = snapshot, policy_version
         self.version, self._unpublished_rollouts = policy_version, 0
-        self._push(snapshot)
-        self._fleet.pushed_bytes += len(snapshot)
-        self._counters.snapshots_published += 1
-
-    def newest(self) -> bytes:
-        """Return the newest published snapshot, encoded."""
-        return self._responses.snapshot()
-
-    def _push(self, payload: bytes) -> None:
         with contextlib.suppress(TransportError):  # the session is being replaced; actors query a missed snapshot
-            self._transport.publish(self._key, payload)
+            self._transport.publish(keys.snapshots(self._context.name), snapshot)
+        self._context.fleet.pushed_bytes += len(snapshot)
+        self._context.counters.snapshots_published += 1
 
     def _count_answer(self, request: SnapshotRequest, size: int) -> None:
         """Count an answer to an actor. Any thread may call this method."""
-        with self._lock:
-            actor = self._fleet.actors.get(request.actor)
+        with self._context.lock:
+            actor = self._context.fleet.actors.get(request.actor)
             if actor is not None:
                 actor.fetches, actor.compact_snapshots = True, request.compact
                 actor.answered_bytes += size
+
+
+def _refusal(code: Literal["not_ready", "unknown"], reason: str) -> bytes:
+    return encode(Refusal(code=code, reason=reason))

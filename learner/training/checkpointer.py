@@ -15,19 +15,16 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daedalus.learner.run.health import SLOW_DISK_SECONDS
 from daedalus.learner.run.process_resources import reserved_descriptors
 from daedalus.learner.run.run_directory import CONFIG, write_config
-from daedalus.learner.run.run_state import RunState
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.evaluations import Evaluated
-from daedalus.learner.serving.events import EventLog
+from daedalus.learner.serving.run_context import SLOW_DISK_SECONDS, RunContext
 from daedalus.learner.training.checkpoint import EncodedCheckpoint, encode_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import TrainingScore
 from daedalus.policy.saving.saved_policy import checkpoint_path
 from daedalus.policy.user_modules import shown_path
-from daedalus.protocol.spaces import Spaces
 
 _logger = logging.getLogger(__name__)
 
@@ -54,31 +51,19 @@ class Saving:
 class Checkpointer:
     """Writer of one learner's checkpoints into its run directory."""
 
-    def __init__(
-        self,
-        state: RunState,
-        learner: Learner,
-        program: bytes,
-        spaces: Spaces,
-        *,
-        events: EventLog,
-        lock: threading.Condition,
-    ) -> None:
+    def __init__(self, context: RunContext, learner: Learner, program: bytes) -> None:
         """Construct the checkpointer, and start its thread.
 
         Args:
-          state: the counters and settings to save. Checkpoints that are being evaluated are not pruned.
+          context: the counters and settings to save. Checkpoints that are being evaluated are not pruned.
           learner: source of the parameters and the optimiser state.
-          program, spaces: content of every checkpoint.
-          events: receives each saved checkpoint and each error.
-          lock: guards the counters.
+          program: content of every checkpoint.
         """
-        self._state, self._spec, self._health = state, state.spec, state.health
-        self._learner, self._program, self._spaces = learner, program, spaces
-        self._events, self._lock = events, lock
+        self._context, self._spec, self._health, self._events = context, context.spec, context.health, context.events
+        self._learner, self._program = learner, program
         self.seconds = 0.0  # that the last checkpoint took to be written
         self._newest: tuple[int, Path] | None = None  # policy version and directory of the last checkpoint
-        self._env_steps = state.counters.env_steps  # of the last checkpoint; at first, of the one that was restored
+        self._env_steps = context.counters.env_steps  # of the last checkpoint; at first, of the one that was restored
         self._advice = ""  # after the last error
         self._unfinished, self._counting = 0, threading.Lock()  # number of jobs
         # Bounded by its users: one checkpoint, the last one, and the results of evaluations in progress.
@@ -101,14 +86,14 @@ class Checkpointer:
           on_end: called on the thread that writes, when the checkpoint is saved or has failed.
         """
         learner = self._learner
-        with self._lock:
-            counters = self._state.saved(time.monotonic())
+        with self._context.lock:
+            counters = self._context.saved(time.monotonic())
             score = self._training_score()
-        directory = checkpoint_path(self._state.directory, learner.policy_version)
+        directory = checkpoint_path(self._context.directory, learner.policy_version)
         saving = Saving(learner.policy_version, counters["env_steps"], directory, last)
         encoded = encode_checkpoint(
             spec=self._spec,
-            spaces=self._spaces,
+            spaces=learner.spaces,
             policy_version=learner.policy_version,
             program=self._program,
             parameters=learner.weights(),
@@ -117,7 +102,7 @@ class Checkpointer:
             score=score,
         )
         # Evaluations that end meanwhile are in it too, and none begins before the thread is idle.
-        in_use = self._state.evaluations.checkpoints_in_use
+        in_use = self._context.evaluations.checkpoints_in_use
 
         def save() -> None:
             try:
@@ -136,26 +121,25 @@ class Checkpointer:
         """Keep the checkpoint of an evaluation if it is among the best, and log the result."""
         self._add(lambda: _logger.info("%s", evaluated.keep()))
 
-    def wait(self, saving: Saving, stop: threading.Event, beat: Callable[[], None], *, patient: bool = True) -> bool:
+    def wait(self, saving: Saving, beat: Callable[[], None], *, patient: bool = True) -> bool:
         """Wait until a checkpoint is written, and return whether it is saved. A slow disk ends the wait.
 
         Args:
           saving: the checkpoint.
-          stop: event that ends the run.
           beat: called again and again, to show that this process works.
-          patient: wait for `STOP_SECONDS` after `stop` is set.
+          patient: wait for `STOP_SECONDS` after the run is stopped.
         """
         began = time.monotonic()
         limit, ending, warned = _FINISH_SECONDS, False, False
         while not saving.done.wait(_POLL_SECONDS):
             waited = time.monotonic() - began
-            if stop.is_set() and not ending:
+            if self._context.stop.is_set() and not ending:
                 limit, ending = min(limit, waited + (STOP_SECONDS if patient else 0.0)), True
             if waited >= limit:
                 break
             if waited >= SLOW_DISK_SECONDS and not warned:
                 warned = True
-                _logger.warning("waiting for the checkpoint: the disk of %s is slow", self._state.directory)
+                _logger.warning("waiting for the checkpoint: the disk of %s is slow", self._context.directory)
             beat()
         if saving.last and not saving.is_saved:
             self._report_loss(saving, time.monotonic() - began)
@@ -167,19 +151,19 @@ class Checkpointer:
         if saving.done.is_set():
             text += f"could not be saved: {self._health.save_fault}; {self._advice}, then resume the run"
         else:
-            text += f"was not saved within {waited:.0f} s: the disk of {self._state.directory} is slow; "
+            text += f"was not saved within {waited:.0f} s: the disk of {self._context.directory} is slow; "
             lost = saving.env_steps - self._env_steps
             text += f"a resumed run continues from {self._env_steps:,} env_steps, and the last {lost:,} are lost"
         self._events.add("checkpoint", text, level=logging.ERROR)
 
     def _training_score(self) -> TrainingScore | None:
         """Return the mean return of the newest training episodes, if there are enough of them and nobody evaluates."""
-        counters = self._state.counters
+        counters = self._context.counters
         mean, episodes = counters.episode_return_mean, counters.target_episodes
         silence = max(_EVALUATOR_SECONDS, 2.0 * (self._spec.evaluation.seconds or 0.0))
         if mean is None or not math.isfinite(mean) or len(counters.returns) < episodes:
             return None
-        if time.monotonic() < self._state.evaluations.heard + silence:
+        if time.monotonic() < self._context.evaluations.heard + silence:
             return None
         return TrainingScore(return_mean=mean, episodes=episodes, true_task=self._spec.environment.trains_true_task)
 
@@ -203,9 +187,9 @@ class Checkpointer:
     def _save(self, saving: Saving, encoded: EncodedCheckpoint, in_use: Set[Path]) -> None:
         began, keep = time.monotonic(), self._spec.service.keep_checkpoints
         try:
-            if self._newest is not None and not (self._state.directory / CONFIG).exists():
+            if self._newest is not None and not (self._context.directory / CONFIG).exists():
                 self._restore_config()
-            save_checkpoint(self._state.directory, encoded, keep=keep, also_keep=in_use)
+            save_checkpoint(self._context.directory, encoded, keep=keep, also_keep=in_use)
         except OSError as error:
             fault = error.strerror or type(error).__name__
             saving.result = f"checkpoint not saved: {fault}"
@@ -231,7 +215,7 @@ class Checkpointer:
 
     def _restore_config(self) -> None:
         """Write config.toml again, without which nobody can resume the run. Raises OSError."""
-        directory = self._state.directory
+        directory = self._context.directory
         directory.mkdir(0o700, parents=True, exist_ok=True)
         try:
             write_config(directory, self._spec)

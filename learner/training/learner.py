@@ -1,7 +1,7 @@
 """The parameters, the optimiser and the policy version, and their updates. No threads, no I/O."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.algorithms.diagnostics import FirstPass, batch_metrics, diagnostics
+from daedalus.algorithms.diagnostics import BATCH_METRICS, FirstPass, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, exact, packed
 from daedalus.algorithms.gradients import GradientComputer, Terms
@@ -26,15 +26,7 @@ from daedalus.algorithms.normalization import (
 from daedalus.learner.run.counters import updates_of
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
-from daedalus.learner.training.gradient_faults import rollouts_at_fault
 from daedalus.learner.training.optimizers import build_optimizer
-from daedalus.learner.training.received_gradients import (
-    batch_metrics_of,
-    diagnostics_of,
-    mean_gradient,
-    mean_terms,
-    moments_in,
-)
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -43,6 +35,92 @@ from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 from daedalus.protocol.uploads import Gradient, Rollout, Upload
+
+
+def rollouts_at_fault(
+    gradients: GradientComputer, joined: Callable[[Sequence[Rollout]], Batch], rollouts: Sequence[Rollout]
+) -> list[Rollout]:
+    """Return the rollouts that have no finite gradient of their own at the present parameters.
+
+    Return none if a rollout of zeros has no finite gradient either: then the parameters are at fault, and no sender.
+    The gradients of the parameters are overwritten; the parameters are not changed.
+
+    Args:
+      gradients: computes the gradients of a batch.
+      joined: returns the batch of rollouts, as the updates have it.
+      rollouts: the rollouts of the batch.
+    """
+
+    def is_finite(rollout: Rollout) -> bool:
+        # All updates of the batch, because a minibatch has only some of its rows.
+        updates = gradients.compute(joined([rollout]), 0.0)
+        return all(bool(gradients.parameters.gradients.norm().isfinite()) for _ in updates)
+
+    if not is_finite(_of_zeros(rollouts[0])):
+        return []
+    return [rollout for rollout in rollouts if not is_finite(rollout)]
+
+
+def _of_zeros(rollout: Rollout) -> Rollout:
+    """Return a rollout of the same shapes whose numbers are 0."""
+    names = ("initial_state", "behaviour_log_probs", "rewards")
+    arrays = {name: np.zeros_like(getattr(rollout, name)) for name in names}
+    frames = {name: np.zeros_like(values) for name, values in rollout.frames.items()}
+    continuous = {name: values for name, values in rollout.actions.items() if values.dtype == np.float32}
+    actions = rollout.actions | {name: np.zeros_like(values) for name, values in continuous.items()}
+    return replace(rollout, **arrays, frames=frames, actions=actions)
+
+
+def weights_of(gradients: Sequence[Gradient]) -> list[float]:
+    """Return the share of each gradient in all env_steps: each valid row then counts once in the mean."""
+    total = max(sum(gradient.env_steps for gradient in gradients), 1)
+    return [gradient.env_steps / total for gradient in gradients]
+
+
+def mean_gradient(gradients: Sequence[Gradient], names: Sequence[str]) -> Tensor:
+    """Return the weighted mean of float32 gradients [P], added up in the given order.
+
+    Args:
+      gradients: those of one batch.
+      names: parameters with gradients, in the order of the vector.
+    """
+    mean = None
+    for gradient, weight in zip(gradients, weights_of(gradients), strict=True):
+        vector = np.concatenate([gradient.gradient[name].ravel() for name in names]) * np.float32(weight)
+        mean = vector if mean is None else mean + vector
+    assert mean is not None
+    return torch.from_numpy(mean)
+
+
+def mean_terms(gradients: Sequence[Gradient], device: torch.device) -> Terms:
+    """Return the weighted means of the loss terms, on a device."""
+    pairs = list(zip(gradients, weights_of(gradients), strict=True))
+    return Terms(
+        *(
+            torch.tensor(sum(float(each.metrics[name]) * share for each, share in pairs), device=device)
+            for name in Terms._fields
+        )
+    )
+
+
+def batch_metrics_of(gradient: Gradient) -> Tensor | None:
+    """Return BATCH_METRICS [3] of the rollout, nan for those that it does not have; None if it has none."""
+    given = [float(gradient.metrics.get(name, np.nan)) for name in BATCH_METRICS]
+    return None if np.isnan(given).all() else torch.tensor(given)
+
+
+def diagnostics_of(gradient: Gradient) -> dict[str, float]:
+    """Return the diagnostics of a rollout; empty for a rollout without valid rows."""
+    others = (*Terms._fields, *BATCH_METRICS)
+    return {name: float(value) for name, value in gradient.metrics.items() if name not in others}
+
+
+def moments_in(gradient: Gradient) -> dict[str, Moments]:
+    """Return the moments of the rollout, by name."""
+    return {
+        name: Moments(gradient.env_steps, *torch.from_numpy(values.copy())) for name, values in gradient.moments.items()
+    }
+
 
 # Names of what actors vote on besides components of observations (algorithms/normalization.py).
 _RETURNS, _REWARDS, _NORM, _METRICS = "returns", "rewards", "gradient norm", "metrics/"
@@ -79,7 +157,7 @@ class Learner:
             )
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
-        self._spec, self._spaces = spec, spaces
+        self._spec, self.spaces = spec, spaces
         self.device = torch.device(spec.device)
         self._network = ActorCritic(policy, spaces, modules, spec).to(self.device)
         self._gradients = GradientComputer(spec, self._network, spaces, modules)
@@ -291,7 +369,7 @@ class Learner:
 
     def program(self) -> bytes:
         """Return the policy program (daedalus/policy/acting/program.py)."""
-        return export_program(self._network, self._spaces)
+        return export_program(self._network, self.spaces)
 
     def weights(self) -> dict[str, np.ndarray]:
         """Return all parameters as numpy arrays.

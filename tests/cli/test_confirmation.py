@@ -16,8 +16,7 @@ from daedalus.cli.commands.evaluate_arguments import parser
 from daedalus.cli.running import confirmation as module
 from daedalus.cli.running.confirmation import Confirmations, confirmation, confirmation_arguments
 from daedalus.learner.run.confirmation_file import ConfirmationFile
-from daedalus.learner.run.run_state import RunState
-from daedalus.learner.serving.events import EventLog
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec, RunSpec, TrainingSpec
 
@@ -162,8 +161,8 @@ def test_after_an_attempt_training_goes_on_for_as_long_as_it_took(tmp_path: Path
     spec = RunSpec(
         environment=EnvironmentSpec(id="A-v0"), training=TrainingSpec(target_return=475.0, target_episodes=1)
     )
-    state, events, stop = RunState(tmp_path, spec, 0.0), EventLog(), threading.Event()
-    learner = TargetConfirmation(state, events, stop, lock=threading.Condition(), beat=lambda: None)
+    state, stop = RunContext.begin(tmp_path, spec, threading.Event()), threading.Event()
+    learner = TargetConfirmation(state, beat=lambda: None)
     file, checkpointer = ConfirmationFile(tmp_path), cast("Checkpointer", Saved())
 
     def launch() -> None:
@@ -180,7 +179,7 @@ def test_after_an_attempt_training_goes_on_for_as_long_as_it_took(tmp_path: Path
         assert not state.counters.reached(475.0)
         for _ in range(100):  # as many updates at once
             assert not learner.confirm(2, checkpointer)
-        assert [event.text for event in events.report() if event.kind == "target"] == [
+        assert [event.text for event in state.events.report() if event.kind == "target"] == [
             "target 475 reached: the policy of this moment plays 1 new episodes to confirm it",
             "not confirmed: return 470.0; training continues",
         ]

@@ -6,18 +6,18 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from building import EPOCH, SPACES, run_spec
+from building import EPOCH, SPACES, run_context
 from statuses import actor_status, run_status
 
 from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
 from daedalus.cli.run_source import LearnerSource
 from daedalus.cli.status_query import ask, ask_events
-from daedalus.learner.reporting import run_reporter
+from daedalus.learner.reporting.run_reporter import RunReporter
+from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run import heartbeat
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.health import Health
 from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.run_context import Health
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, STATUS_REQUEST_LIMITS
@@ -35,7 +35,6 @@ from daedalus.protocol.messages import (
     Origin,
     Refusal,
     RefusedJoin,
-    RunStatus,
     StatusReport,
 )
 from daedalus.protocol.spaces import DiscreteSpace
@@ -57,20 +56,16 @@ def operator() -> MemoryTransport:
 @pytest.fixture
 def server(operator: MemoryTransport) -> Iterator[ActorServer]:
     """Server with many actors, half of which are present."""
-    spec, counters = run_spec(), RunCounters(10)
     health = Health(started=0.0, updated=0.0, actor_seen=0.0)
-
-    def status() -> RunStatus:
-        return run_reporter.run_status("r", EPOCH, spec, counters, opened.fleet, {}, health, 0, 1.0)
-
-    transport = MemoryTransport(operator._network)
-    opened = ActorServer("r", spec, transport, counters, status, learner_epoch=EPOCH, start_version=0, spaces=SPACES)
+    context = run_context(health=health)
+    reporter = RunReporter(context, UserMetrics())
+    opened = ActorServer(context, MemoryTransport(operator._network), lambda: reporter.status(0, 1.0))
     opened.open()
     for number in range(MANY):
         join = Join(actor=f"pod-{number}", incarnation=1, spaces=SPACES, environments=1)
-        assert opened.fleet.join(join, 0.0) is None
-        opened.fleet.set_present(join.actor, 1, number % 2 == 0, 0.0)
-        opened.fleet.actors[join.actor].quarantined = "x" * 500 if number == 2 else ""
+        assert context.fleet.join(join, 0.0) is None
+        context.fleet.set_present(join.actor, 1, number % 2 == 0, 0.0)
+        context.fleet.actors[join.actor].quarantined = "x" * 500 if number == 2 else ""
     yield opened
     opened.close("the test is over")
 
@@ -83,7 +78,7 @@ def query(operator: MemoryTransport, payload: bytes) -> Message:
 def test_status_contains_every_actor_of_a_large_fleet(server: ActorServer, operator: MemoryTransport) -> None:
     """The status of so many actors once exceeded the reader's limit, and Kubernetes restarted the learner."""
     (status,) = ask(operator)
-    assert [actor.actor for actor in status.actors] == sorted(server.fleet.actors)
+    assert [actor.actor for actor in status.actors] == sorted(server.context.fleet.actors)
     assert (status.actors_alive, status.actors_quarantined, status.actors_gone) == (452, 1, 452)
     assert status.fleet_size == MANY
 
@@ -97,12 +92,12 @@ def test_number_of_fetched_actors_can_be_limited(server: ActorServer, operator: 
 
 
 def test_actor_that_leaves_between_two_pages_costs_no_other(server: ActorServer, operator: MemoryTransport) -> None:
-    names = sorted(server.fleet.actors)
+    names = sorted(server.context.fleet.actors)
     report = query(operator, b"")
     assert isinstance(report, StatusReport)
     assert [actor.actor for actor in report.status.actors] == names[:PAGE_ACTORS]
     for name in (names[5], names[PAGE_ACTORS - 1]):
-        del server.fleet.actors[name]
+        del server.context.fleet.actors[name]
     more = query(operator, encode(ActorsRequest(after=names[PAGE_ACTORS - 1])))
     assert isinstance(more, ActorsReport)
     assert [actor.actor for actor in more.page.actors] == names[PAGE_ACTORS : 2 * PAGE_ACTORS]
@@ -210,7 +205,7 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
     counts = {sample.labels["state"]: sample.value for sample in samples if sample.name == "daedalus_actors"}
     assert counts == {"alive": 452, "quarantined": 1, "gone": 452}
     series = {sample.labels["actor"] for sample in samples if "actor" in sample.labels}
-    present = [name for name in sorted(server.fleet.actors)[: 2 * PAGE_ACTORS] if int(name[4:]) % 2 == 0]
+    present = [name for name in sorted(server.context.fleet.actors)[: 2 * PAGE_ACTORS] if int(name[4:]) % 2 == 0]
     assert series == set(present)
     (warning,) = caplog.messages
     assert f"has 905 actors: {2 * PAGE_ACTORS} of them have metrics of their own" in warning

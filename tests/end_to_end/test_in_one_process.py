@@ -16,8 +16,10 @@ from daedalus.actor.session.service import ActorService
 from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.resuming import Beginning
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec
-from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.service import LearnerService, Outcome, Outputs
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
@@ -46,16 +48,11 @@ class RunningLearner:
     def __init__(self, network: MemoryNetwork, spec: RunSpec, directory: Path, *, resume: bool = False) -> None:
         self.stop, self.rows, self.outcomes = threading.Event(), Rows(), list[Outcome]()
         self._transport = MemoryTransport(network)
-        service = LearnerService(
-            spec,
-            directory,
-            self._transport,
-            self.stop,
-            Progress(io.StringIO(), spec.training.env_steps),
-            [lambda: self.rows],
-            started=0.0,
-            restored=load_newest(directory) if resume else None,
-        )
+        restored = load_newest(directory) if resume else None
+        context = RunContext.begin(directory, spec, self.stop, restored=restored)
+        progress = Progress(io.StringIO(), spec.training.env_steps)
+        outputs = Outputs(progress=progress, writers=[lambda: self.rows])
+        service = LearnerService(context, self._transport, outputs, Beginning(restored=restored))
         self._thread = threading.Thread(target=lambda: self.outcomes.append(service.run()), daemon=True)
         self._thread.start()
 

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from building import ENVIRONMENTS, EPOCH, POLICY, RECURRENT, SPACES, identity, make_rollout, run_spec
+from building import ENVIRONMENTS, EPOCH, POLICY, RECURRENT, SPACES, identity, make_rollout, run_context, run_spec
 from log_lines import LINES
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving import rollout_intake, session_watchdog
+from daedalus.learner.serving import actor_server, rollout_intake
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.query_responses import Orders
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -54,7 +53,7 @@ def no_status() -> RunStatus:
 def open_server(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) -> ActorServer:
     """Return an open server."""
     transport = MemoryTransport(network)
-    server = ActorServer("r", spec, transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES)
+    server = ActorServer(run_context(spec, counters=counters), transport, no_status)
     server.open()
     return server
 
@@ -111,7 +110,7 @@ def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken
     finally:
         server.close("the test is over")
     assert (counters.updates, counters.rollouts_trained, counters.policy_lag_sum) == (2 * updates, 2, 0)
-    events = server.events.report()
+    events = server.context.events.report()
     assert [(event.kind, event.count) for event in events] == [
         *(("started", 1), ("joined", 1), ("rejected", 2), ("ended", 1))
     ]
@@ -152,7 +151,7 @@ def test_rows_that_only_reset_are_not_counted_for_their_actor(network: MemoryNet
         rollout = make_rollout(identity("a"))
         actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
         server.rollouts.count_trained(server.rollouts.take_batch(0), [])
-        assert server.fleet.actors["a"].env_steps == np.count_nonzero(rollout.valid) < rollout.valid.size
+        assert server.context.fleet.actors["a"].env_steps == np.count_nonzero(rollout.valid) < rollout.valid.size
     finally:
         server.close("the test is over")
 
@@ -198,7 +197,7 @@ def test_evaluator_messages_are_queued_until_the_learner_takes_them(
     assert asked == EvaluationRequest(evaluator="e")
     assert isinstance(report, EvaluationReport)
     assert server.evaluations.take_requests() == server.evaluations.take_reports() == []
-    first.reply(server.publisher.newest())
+    first.reply(server.publisher.snapshot())
     (answer,) = evaluator.answers
     assert isinstance(answer, Snapshot)
     assert answer.policy_version == 3
@@ -215,7 +214,7 @@ def test_newer_message_of_an_evaluator_replaces_the_older_one(
     assert codes(evaluator) == ["not_ready"] * 2
     waiting = server.evaluations.take_requests() + server.evaluations.take_reports()
     assert len(waiting) == 1
-    waiting[0][0].reply(server.publisher.newest())
+    waiting[0][0].reply(server.publisher.snapshot())
     assert isinstance(evaluator.answers[-1], Snapshot)
 
 
@@ -315,11 +314,9 @@ class UnreachableTransport(MemoryTransport):
 
 
 def test_session_is_reopened_when_no_request_arrives(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 0.02)
-    transport, counters = UnreachableTransport(network), RunCounters(10)
-    server = ActorServer(
-        "r", run_spec(), transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
-    )
+    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 0.02)
+    transport = UnreachableTransport(network)
+    server = ActorServer(run_context(), transport, no_status)
     server.open()
     try:
         for _ in range(3):
@@ -329,7 +326,7 @@ def test_session_is_reopened_when_no_request_arrives(network: MemoryNetwork, mon
 
 
 def test_request_resets_the_session_watchdog(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 1000.0)
+    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 1000.0)
     server = open_server(network, run_spec(), RunCounters(10))
     try:
         before = server._watchdog._heard_at
@@ -350,7 +347,7 @@ def test_stale_rollouts_are_counted_for_the_run_when_their_actor_was_evicted(net
             timeout=LIMIT,
         )
         actor.query(keys.rollouts("r", "a"), encode(make_rollout(identity("a"))), timeout=LIMIT)
-        del server.fleet.actors["a"]
+        del server.context.fleet.actors["a"]
         assert server.rollouts.take_batch(5) == []
         assert counters.rollouts_rejected == {"stale": 1}
     finally:
@@ -390,7 +387,7 @@ def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
         verdicts = [message.verdict for message in messages if isinstance(message, Acknowledgement)]
         assert verdicts == ["accepted"] * held + ["busy"] * 2
         assert answers.empty()
-        assert server.fleet.actors["a"].busy == 2
+        assert server.context.fleet.actors["a"].busy == 2
     finally:
         server.close("the test is over")
 
@@ -450,12 +447,12 @@ def test_requested_snapshot_is_sent_unless_the_actor_holds_it_and_counts_for_the
     assert isinstance(decode(request(None), Limits()), Refusal)
     server.publisher.publish(3, weights)
     answers = [request(held) for held in (None, 2, 3)]
-    whole = server.publisher.newest()
+    whole = server.publisher.snapshot()
     assert answers[:2] == [whole, whole]
     unchanged = decode(answers[2], Limits())
     assert isinstance(unchanged, Refusal)
     assert unchanged.code == "not_ready"
-    actor = server.fleet.actors["a0"]
+    actor = server.context.fleet.actors["a0"]
     assert (actor.fetches, actor.compact_snapshots) == (True, False)
     assert actor.answered_bytes > 2 * len(whole)
     server.close("solved", finished=True)
@@ -503,14 +500,10 @@ def version_of(data: bytes | None) -> int:
 def test_a_learner_steps_down_for_a_newer_one_of_its_run(
     network: MemoryNetwork, difference: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_watchdog, "_LOOK_SECONDS", 0.02)
-    stop = threading.Event()
-    orders = Orders(stop)
+    monkeypatch.setattr(actor_server, "_LOOK_SECONDS", 0.02)
     transport, other, actor = MemoryTransport(network), MemoryTransport(network), MemoryTransport(network)
-    server = ActorServer(
-        "r", run_spec(), transport, RunCounters(10), no_status,
-        learner_epoch=EPOCH, start_version=0, spaces=SPACES, orders=orders,
-    )  # fmt: skip
+    server = ActorServer(run_context(), transport, no_status)
+    stop, orders = server.context.stop, server.orders
     server.open()
     ends = actor.subscribe(keys.run_end("r"), lambda: None)
     page = ActorsPage(learner_epoch=EPOCH + difference, actors=())

@@ -11,17 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from building import POLICY, SPACES, make_rollouts, run_spec
+from building import POLICY, SPACES, make_rollouts, run_context, run_spec
 from log_lines import LINES
 
-from daedalus.learner.run import health, run_directory
+from daedalus.learner.run import run_directory
 from daedalus.learner.run.candidates import candidates
-from daedalus.learner.run.counters import check_counters
 from daedalus.learner.run.heartbeat import HEARTBEAT, Heartbeat
 from daedalus.learner.run.process_resources import reserve_descriptors
-from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.evaluations import Evaluated
-from daedalus.learner.serving.events import EventLog
+from daedalus.learner.serving.run_context import Health, RunContext
 from daedalus.learner.training import checkpointer as module
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest
 from daedalus.learner.training.checkpointer import Checkpointer, Saving
@@ -36,13 +34,11 @@ from daedalus.protocol.spec import RunSpec, TrainingSpec
 class Run:
     """A learner and its checkpointer."""
 
-    def __init__(self, directory: Path, spec: RunSpec | None = None) -> None:
-        self.directory, self.events = directory, EventLog()
-        self.state = RunState(directory, spec or run_spec(), started=0.0)
+    def __init__(self, directory: Path, spec: RunSpec | None = None, context: RunContext | None = None) -> None:
+        self.directory = directory
+        self.state = context or run_context(spec, directory)
         self.learner = Learner(TrainingSpec(), POLICY, SPACES)
-        self.checkpointer = Checkpointer(
-            self.state, self.learner, b"program", SPACES, events=self.events, lock=threading.Condition()
-        )
+        self.checkpointer = Checkpointer(self.state, self.learner, b"program")
 
     def train(self, seed: int = 1) -> None:
         self.learner.step(make_rollouts(seed), 0.0)
@@ -50,14 +46,13 @@ class Run:
     def save(self, **how: Any) -> Saving:
         """Save a checkpoint to the end."""
         saving = self.checkpointer.begin(**how)
-        self.checkpointer.wait(saving, threading.Event(), lambda: None)
+        self.checkpointer.wait(saving, lambda: None)
         return saving
 
     def finish_last(self) -> bool:
         """Save the last checkpoint of a learner that is stopped; return whether it is saved."""
-        stop = threading.Event()
-        stop.set()
-        return self.checkpointer.wait(self.checkpointer.begin(last=True), stop, lambda: None)
+        self.state.stop.set()
+        return self.checkpointer.wait(self.checkpointer.begin(last=True), lambda: None)
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -67,7 +62,7 @@ class Run:
 
     @property
     def texts(self) -> list[str]:
-        return [event.text for event in self.events.report()]
+        return [event.text for event in self.state.events.report()]
 
 
 class Disk:
@@ -156,7 +151,7 @@ def test_a_checkpoint_is_of_the_moment_when_it_was_begun_although_training_goes_
     expected = {name: array.copy() for name, array in run.learner.weights().items()}
     assert not run.checkpointer.idle
     disk.free()
-    assert run.checkpointer.wait(saving, threading.Event(), lambda: None)
+    assert run.checkpointer.wait(saving, lambda: None)
     saved = load_checkpoint(saving.directory)
     assert saved.policy.policy_version == 1
     other.restore(1, saved.policy.weights, saved.state)
@@ -176,7 +171,7 @@ def test_a_slow_disk_is_a_problem_until_the_checkpoint_is_saved(
     assert problem.endswith(f" s: the disk of {run.directory} is slow; training continues")
     monkeypatch.setattr(module, "SLOW_DISK_SECONDS", 0.0)
     disk.free()
-    assert run.checkpointer.wait(saving, threading.Event(), lambda: None)
+    assert run.checkpointer.wait(saving, lambda: None)
     assert run.save().is_saved  # the first one is completely done
     assert run.problems == ()
     assert any(text.endswith(" s: the disk is slow") for text in run.texts)
@@ -223,7 +218,7 @@ def test_an_evaluated_checkpoint_is_kept_although_newer_ones_are_saved_before(tm
 
 
 def test_problems_name_metrics_that_are_not_written() -> None:
-    state = health.Health(started=0.0, updated=50.0, actor_seen=50.0, directory="runs/x", recording_since=lambda: 10.0)
+    state = Health(started=0.0, updated=50.0, actor_seen=50.0, directory="runs/x", recording_since=lambda: 10.0)
     text = "metrics have been writing for 40 s: the disk of runs/x is slow; training continues"
     assert state.problems(50.0, 1) == (text,)
     assert state.problems(20.0, 1) == ()
@@ -287,12 +282,18 @@ def test_training_returns_of_too_few_episodes_or_of_an_evaluated_run_are_no_scor
 
 
 def test_a_learner_that_resumes_is_newer_than_every_learner_before_its_checkpoint(tmp_path: Path) -> None:
-    first = RunState(tmp_path, run_spec(), started=0.0)
-    saved = check_counters(first.saved(now=1.0))
-    copies = [RunState(tmp_path, run_spec(), 0.0, starts_before=saved["starts"]) for _ in range(20)]
+    run = Run(tmp_path)
+    run.save()
+
+    def resumed() -> RunContext:
+        return RunContext.begin(tmp_path, run_spec(), threading.Event(), restored=load_newest(tmp_path))
+
+    first = RunContext.begin(tmp_path, run_spec(), threading.Event())
+    copies = [resumed() for _ in range(20)]
     assert all(first.learner_epoch < copy.learner_epoch < 2**62 for copy in copies)
     assert len({copy.learner_epoch for copy in copies}) == len(copies)
-    after = RunState(tmp_path, run_spec(), 0.0, starts_before=check_counters(copies[0].saved(now=1.0))["starts"])
+    Run(tmp_path, context=copies[0]).save()
+    after = resumed()
     assert after.learner_epoch > max(copy.learner_epoch for copy in copies)
     assert new_epoch(10**9) < 2**62
 

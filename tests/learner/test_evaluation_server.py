@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from building import EPOCH, SPACES, run_spec
+from building import EPOCH, run_context
 
-from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.evaluations import Evaluated, Evaluations
+from daedalus.learner.serving.evaluations import Evaluated
 from daedalus.learner.training.checkpointer import Saving
 from daedalus.learner.training_loop import EvaluationServer
 from daedalus.protocol import keys
@@ -60,22 +59,13 @@ class Scene:
     def __init__(self) -> None:
         network = MemoryNetwork()
         self.now, self.save_seconds = 100.0, 0.0
-        self.actors = ActorServer(
-            "r",
-            run_spec(),
-            MemoryTransport(network),
-            RunCounters(10),
-            lambda: pytest.fail("no status is queried"),
-            learner_epoch=EPOCH,
-            start_version=0,
-            spaces=SPACES,
-        )
+        context = run_context()
+        context.counters.env_steps = 1000
+        self.actors = ActorServer(context, MemoryTransport(network), lambda: pytest.fail("no status is queried"))
         self.actors.open()
         self.actors.offer_policy(b"program", 0)
-        self.evaluations = Evaluations(EPOCH, RunCounters(10))
-        self.server = EvaluationServer(
-            self.actors.evaluations, self.evaluations, self.actors.publisher, clock=lambda: self.now
-        )
+        self.evaluations = context.evaluations
+        self.server = EvaluationServer(context, self.actors.evaluations, self.actors.publisher, clock=lambda: self.now)
         self.learner, self.checkpointer = FakeLearner(), FakeCheckpointer(self)
         self._transport = MemoryTransport(network)
 
@@ -106,7 +96,7 @@ class Scene:
         )
 
     def serve(self) -> None:
-        self.server.serve(self.learner, self.checkpointer, 1000)  # type: ignore[arg-type] - fakes
+        self.server.serve(self.learner, self.checkpointer)  # type: ignore[arg-type] - fakes
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ class Run:
 
     def __init__(self, directory: Path, epoch: int = EPOCH) -> None:
         self.directory = directory
-        self.evaluations = Evaluations(epoch, RunCounters(10))
+        self.evaluations, self._epoch = Evaluations(RunCounters(10)), epoch
 
     def save(self, version: int, keep: int = 2) -> Path:
         encoded = encode_checkpoint(
@@ -57,7 +57,7 @@ class Run:
 
     def send(self, report: EvaluationReport) -> tuple[Acknowledgement, str]:
         """Return the answer and the log message, after the checkpoint was kept if it is to be."""
-        answer, evaluated = self.evaluations.report(report)
+        answer, evaluated = self.evaluations.report(report, self._epoch)
         return answer, evaluated.keep() if evaluated is not None else ""
 
     def play(self, version: int, *returns: float) -> str:
@@ -251,14 +251,14 @@ def test_mean_of_returns_does_not_overflow_float32(run: Run) -> None:
 
 
 def test_number_of_checkpoints_in_use_is_bounded_when_evaluators_never_report(tmp_path: Path) -> None:
-    evaluations = Evaluations(1, RunCounters(10))
+    evaluations = Evaluations(RunCounters(10))
     for number in range(100):
         evaluations.begin(f"evaluator-{number}", tmp_path / str(number), number, 0)
     assert evaluations.checkpoints_in_use == {tmp_path / str(number) for number in range(84, 100)}
 
 
 def test_evaluations_of_one_owner_do_not_displace_the_others(tmp_path: Path) -> None:
-    evaluations = Evaluations(1, RunCounters(10))
+    evaluations = Evaluations(RunCounters(10))
     evaluations.begin("honest", tmp_path / "honest", 0, 0)
     for number in range(100):
         evaluations.begin(f"greedy.{number}", tmp_path / str(number), number, 0)

@@ -2,7 +2,6 @@
 
 import io
 import threading
-import time
 from pathlib import Path
 
 from building import SPACES, run_spec
@@ -10,7 +9,8 @@ from log_lines import LINES
 from processes import LIMIT, until
 
 from daedalus.learner.reporting.progress import Progress
-from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.service import LearnerService, Outcome, Outputs
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -27,9 +27,8 @@ def test_a_foreign_join_that_comes_first_is_refused_and_leaves_no_trace(tmp_path
 
     def learn() -> None:
         progress = Progress(io.StringIO(), 1)
-        service = LearnerService(
-            run_spec(), directory, MemoryTransport(network), stop, progress, [], started=time.monotonic(), spaces=SPACES
-        )
+        context = RunContext.begin(directory, run_spec(), stop, spaces=SPACES)
+        service = LearnerService(context, MemoryTransport(network), Outputs(progress=progress))
         outcomes.append(service.run())
 
     def ask(key: str, payload: bytes = b"") -> Message:

@@ -1,16 +1,13 @@
 """learner/serving/rollout_intake.py while the buffer is full: every request gets its answer in time."""
 
 import queue
-import threading
 from collections.abc import Iterator
 
 import pytest
-from building import EPOCH, identity, joined_fleet, make_rollout, run_spec
+from building import identity, joined_fleet, make_rollout, run_context, run_spec
 from processes import LIMIT, until
 
-from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving import rollout_intake
-from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
@@ -40,18 +37,10 @@ class Intake:
     """Open intake, and the answers that it gives."""
 
     def __init__(self) -> None:
-        self.counters, self.lock = RunCounters(10), threading.Condition()
         spec = run_spec(algorithm="impala", batch_rollouts=HELD, max_policy_lag=100)
-        self.rollouts = RolloutIntake(
-            spec,
-            self.lock,
-            joined_fleet("a"),
-            self.counters,
-            lambda: 0,
-            EventLog(),
-            learner_epoch=EPOCH,
-            start_version=0,
-        )
+        context = run_context(spec, fleet=joined_fleet("a"))
+        self.counters, self.lock = context.counters, context.lock
+        self.rollouts = RolloutIntake(context, lambda: 0)
         self._answers: queue.SimpleQueue[tuple[int, str]] = queue.SimpleQueue()
         self.rollouts.open()
 

@@ -1,6 +1,5 @@
 """Rollouts without a finite gradient: they are found and left out, and their senders are quarantined."""
 
-import threading
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 import torch
 from building import (
     ENVIRONMENTS,
-    EPOCH,
     POLICY,
     RECURRENT,
     ROWS,
@@ -16,11 +14,9 @@ from building import (
     identity,
     joined_fleet,
     make_rollout,
-    run_spec,
+    run_context,
 )
 
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import NON_FINITE, Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.learner.training.learner import Learner
@@ -162,11 +158,8 @@ def test_new_incarnation_starts_with_a_clean_record() -> None:
 
 
 def test_rollouts_at_fault_are_counted_for_their_senders_and_the_run() -> None:
-    fleet, counters = joined_fleet("a", "b"), RunCounters(10)
-    events = EventLog()
-    intake = RolloutIntake(
-        run_spec(), threading.Condition(), fleet, counters, lambda: 0, events, learner_epoch=EPOCH, start_version=0
-    )
+    context = run_context(fleet=joined_fleet("a", "b"))
+    fleet, counters, intake = context.fleet, context.counters, RolloutIntake(context, lambda: 0)
     batch = [rollout("a"), rollout("b"), make_rollout(identity("b", incarnation=9)), rollout("z")]
     for _ in range(3):
         intake.count_trained(batch, [batch[1], batch[3]])
@@ -174,5 +167,5 @@ def test_rollouts_at_fault_are_counted_for_their_senders_and_the_run() -> None:
     assert fleet.live == {"a"}
     assert not fleet.actors["a"].rejected
     assert fleet.actors["b"].rejected == {"non_finite": 3}
-    found = [(event.kind, event.actor, event.count) for event in events.report()]
+    found = [(event.kind, event.actor, event.count) for event in context.events.report()]
     assert found == [("rejected", "b", 3), ("rejected", "z", 3), ("quarantined", "b", 1)]

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -27,10 +26,11 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.resuming import CheckpointMismatchError, finished_run
+from daedalus.learner.run.resuming import Beginning, CheckpointMismatchError, finished_run
 from daedalus.learner.run.run_directory import read_json, write_json
-from daedalus.learner.service import LearnerService
+from daedalus.learner.service import LearnerService, Outputs
 from daedalus.learner.serving.events import read_events
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.training.checkpoint import Checkpoint, load_newest
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score, keep_if_best
@@ -96,18 +96,11 @@ class TrainingRun:
         progress = Progress(io.StringIO(), self.spec.training.env_steps)
         try:
             writers = [lambda: CsvWriter(self.directory / "metrics.csv")]
-            LearnerService(
-                self.spec,
-                self.directory,
-                transport,
-                self.stop,
-                progress,
-                writers,
-                started=time.monotonic(),
-                restored=self._restored,
-                initial=self._initial,
-                other_spaces=self._other_spaces,
-            ).run()
+            context = RunContext.begin(self.directory, self.spec, self.stop, restored=self._restored)
+            beginning = Beginning(
+                restored=self._restored, initial=self._initial, allows_other_spaces=self._other_spaces
+            )
+            LearnerService(context, transport, Outputs(progress=progress, writers=writers), beginning).run()
         finally:
             transport.close()
 

@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 
 import pytest
-from building import ENVIRONMENTS, EPOCH, SPACES, run_spec
+from building import ENVIRONMENTS, SPACES, run_context, run_spec
 
-from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.protocol import keys
@@ -46,9 +45,7 @@ def server(transport: MemoryTransport) -> Iterator[ActorServer]:
     service = run_spec().service.model_copy(update={"queue_megabytes": 0.07})
     collection = run_spec().collection.model_copy(update={"envs_per_actor": 500})
     spec = run_spec().model_copy(update={"service": service, "collection": collection})
-    opened = ActorServer(
-        "r", spec, transport, RunCounters(10), no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
-    )
+    opened = ActorServer(run_context(spec), transport, no_status)
     opened.open()
     yield opened
     opened.close("the test is over")
@@ -90,7 +87,7 @@ def test_rollout_above_the_size_of_the_run_is_rejected_unread(server: ActorServe
     answer = send_rollout(transport, 400 * MIB)
     assert answer.verdict == "rejected"
     assert answer.reason.startswith("the message has 419,430,400 bytes, and a rollout of this actor at most ")
-    assert server.fleet.actors["a"].rejected == {"malformed": 1}
+    assert server.context.fleet.actors["a"].rejected == {"malformed": 1}
 
 
 def test_rollout_above_the_queue_is_rejected_with_the_setting_to_raise(

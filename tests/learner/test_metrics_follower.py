@@ -1,10 +1,10 @@
-"""learner/reporting/trackers/metrics_follower.py: every complete row of a growing metrics.csv, once."""
+"""learner/reporting/trackers/tracking.py: every complete row of a growing metrics.csv, once."""
 
 from pathlib import Path
 
 from daedalus.learner.reporting.csv_writer import CsvWriter, cut_rows
 from daedalus.learner.reporting.metrics_rows import Details
-from daedalus.learner.reporting.trackers.metrics_follower import MetricsFollower
+from daedalus.learner.reporting.trackers.tracking import MetricsFollower
 
 
 def steps(follower: MetricsFollower) -> list[float]:

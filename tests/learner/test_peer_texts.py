@@ -1,15 +1,14 @@
 """Texts of peers: the learner bounds them where they enter its state; its memory and its messages stay small."""
 
-import threading
 from dataclasses import replace
 
 import pytest
-from building import ENVIRONMENTS, EPOCH, SPACES, identity, joined_fleet, make_rollout, run_spec
+from building import ENVIRONMENTS, EPOCH, SPACES, identity, joined_fleet, make_rollout, run_context, run_spec
 
-from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.query_responses import QueryResponses, page, totals
+from daedalus.learner.serving.query_responses import JoinResponses, page, totals
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
+from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, Limits
 from daedalus.protocol.messages import (
@@ -23,6 +22,7 @@ from daedalus.protocol.messages import (
     RunStatus,
     StatusReport,
 )
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 FACE = "\U0001f600"  # four bytes in UTF-8
 ORIGIN = Origin(host=FACE * 64, software=FACE * 64, address=FACE * 64)
@@ -57,8 +57,8 @@ def test_the_reason_of_a_quarantine_is_bounded_and_printable() -> None:
 
 def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
     names = [f"a.{number:02d}".ljust(64, "x") for number in range(PAGE_ACTORS)]
-    fleet = Fleet(1, SPACES)
-    responses = QueryResponses("run", run_spec().for_actors(), EPOCH, 0, fleet, threading.Condition(), EventLog())
+    context = run_context()
+    fleet, responses = context.fleet, JoinResponses(context)
     for name in names:
         join = Join(actor=name, incarnation=1, spaces=SPACES, environments=ENVIRONMENTS, origin=ORIGIN)
         responses.join(name, encode(join), 0.0)
@@ -93,15 +93,14 @@ def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
 @pytest.mark.parametrize("name", ["\x01" * 65_000, FACE * 16_000])
 def test_a_refusal_that_names_a_peer_is_small(name: str) -> None:
     """A name can have the 64 KiB of a key, and as a literal four times as many."""
-    responses = QueryResponses(
-        "run", run_spec().for_actors(), EPOCH, 0, Fleet(1, None), threading.Condition(), EventLog()
-    )
+    context = run_context(spaces=None)
+    responses = JoinResponses(context)
     for answer in (
         responses.join(name, encode(Join(actor=name, incarnation=1)), 0.0),
         responses.join(name, encode(Join(actor="a", incarnation=1)), 0.0),
         responses.join("a", encode(Join(actor=name, incarnation=1)), 0.0),
         responses.report(name, encode(ClientReport(actor="a", incarnation=1))),
-        responses.program(name),
+        SnapshotPublisher(context, MemoryTransport(MemoryNetwork())).program(name),
     ):
         refusal = decode(answer, Limits(max_header_bytes=2048))
         assert isinstance(refusal, Refusal)

@@ -1,15 +1,16 @@
 """learner/serving/query_responses.py: answers before, during and after a run."""
 
 import struct
-import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from building import run_context
 from plain import vector_spaces
 
-from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.query_responses import QueryResponses, page
+from daedalus.learner.serving.query_responses import JoinResponses, page
+from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
@@ -21,18 +22,24 @@ from daedalus.protocol.messages import (
     Program,
     Refusal,
     RunEnded,
+    Snapshot,
     Welcome,
 )
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 SPACES = vector_spaces(4, 2)
 SPEC = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
 
 
-def make_responses() -> tuple[QueryResponses, Fleet]:
-    fleet = Fleet(seed=1, spaces=None)
-    return QueryResponses("run", SPEC.for_actors(), 5, 0, fleet, threading.Condition(), EventLog()), fleet
+def make_responses() -> tuple[JoinResponses, Fleet]:
+    context = run_context(SPEC, Path("run"), spaces=None, learner_epoch=5)
+    return JoinResponses(context), context.fleet
+
+
+def make_publisher() -> SnapshotPublisher:
+    return SnapshotPublisher(run_context(), MemoryTransport(MemoryNetwork()))
 
 
 def read(data: bytes) -> Message:
@@ -95,40 +102,41 @@ def test_refused_actor_is_listed_until_it_has_joined() -> None:
     assert fleet.actors["a"].origin == ORIGIN
 
 
-def test_program_is_found_by_its_hash() -> None:
-    responses, _ = make_responses()
-    program = Program(hash="abc", model=np.zeros(3, np.uint8))
-    responses.offer_program(program)
-    answer = read(responses.program("abc"))
-    assert isinstance(answer, Program)
-    unknown = read(responses.program("x" * 1000))
+def test_program_is_found_by_its_hash_and_by_a_wildcard() -> None:
+    publisher = make_publisher()
+    early = read(publisher.program("*"))
+    assert isinstance(early, Refusal)
+    assert early.code == "unknown"
+    publisher.offer_program(b"model")
+    current = read(publisher.program("*"))
+    assert isinstance(current, Program)
+    assert publisher.program(current.hash) == publisher.program("*")
+    unknown = read(publisher.program("x" * 1000))
     assert isinstance(unknown, Refusal)
     assert unknown.code == "unknown"
 
 
-def test_wildcard_returns_the_current_program() -> None:
-    responses, _ = make_responses()
-    early = read(responses.program("*"))
-    assert isinstance(early, Refusal)
-    assert early.code == "unknown"
-    responses.offer_program(Program(hash="abc", model=np.zeros(3, np.uint8)))
-    answer = read(responses.program("*"))
-    assert isinstance(answer, Program)
-    assert answer.hash == "abc"
-
-
 def test_snapshot_query_returns_refusal_then_snapshot_then_run_ended() -> None:
-    responses, _ = make_responses()
-    first = read(responses.snapshot())
+    publisher = make_publisher()
+    first = read(publisher.snapshot())
     assert isinstance(first, Refusal)
     assert first.code == "not_ready"
-    responses.offer_snapshot(b"newest", 4)
-    assert responses.snapshot() == responses.snapshot(3) == b"newest"
-    unchanged = read(responses.snapshot(4))
+    publisher.publish(4, {"w": np.zeros(1, np.float32)})
+    newest = read(publisher.snapshot())
+    assert isinstance(newest, Snapshot)
+    assert newest.policy_version == 4
+    assert publisher.snapshot(3) == publisher.snapshot()
+    unchanged = read(publisher.snapshot(4))
     assert isinstance(unchanged, Refusal)
     assert unchanged.code == "not_ready"
-    responses.end(b"run_ended", finished=True)
-    assert responses.snapshot() == responses.snapshot(4) == b"run_ended"
+    publisher.end(b"run_ended")
+    publisher.publish(5, {"w": np.zeros(1, np.float32)})  # by a learner that is in an update
+    assert publisher.snapshot() == publisher.snapshot(4) == b"run_ended"
+
+
+def test_join_after_the_end_is_refused() -> None:
+    responses, _ = make_responses()
+    responses.end(finished=True)
     late = read(responses.join("a", encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(late, Refusal)
     assert late.code == "finished"

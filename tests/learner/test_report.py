@@ -2,29 +2,25 @@
 
 import dataclasses
 import json
-import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_spec
+from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_context, run_spec
 
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.learning_hints import EpisodeHint
-from daedalus.learner.reporting.metrics_rows import COLUMNS
+from daedalus.learner.reporting.metrics_rows import COLUMNS, Details
 from daedalus.learner.reporting.run_reporter import (
     RateMeter,
     RunReporter,
     episode_statistics,
-    metrics_row,
-    run_status,
-    summary,
 )
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.health import Health
-from daedalus.learner.run.run_state import RunState
+from daedalus.learner.serving.run_context import Health
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS
 
@@ -110,21 +106,32 @@ def test_episode_statistics_are_over_the_newest_episodes() -> None:
     )
 
 
+def learner_with(metrics: dict[str, float]) -> Any:
+    """Return a learner that has made updates with these metrics."""
+    return SimpleNamespace(
+        metrics=SimpleNamespace(take_means=lambda: metrics),
+        take_diagnostics=dict,
+        learning_rate=lambda progress: 0.1,
+        entropy_bonus=lambda progress: 0.2,
+    )
+
+
 def test_row_has_every_column_when_all_values_are_known() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
     fleet.set_present("b", 1, False, 0.0)
-    rates = RateMeter(RunCounters(100), 0.0).measure(counters, fleet, 1.0)
-    learning = {**dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
-    learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
-    row = metrics_row(counters, fleet, rates, learning, 9.5)
+    context = run_context(counters=counters, fleet=fleet, started=1.5)
+    reporter = RunReporter(context, UserMetrics())
+    counters.trained([make_rollout(version=3, valid=EVERYTHING)], 5, 1)
+    context.evaluations.newest = {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
+    row = reporter.row(learner_with(dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5)), 11.0)
     assert set(row) == set(COLUMNS)
-    assert (row["wall_seconds"], row["env_steps"], row["updates"]) == (9.5, 18, 1)
+    assert (row["wall_seconds"], row["env_steps"], row["updates"]) == (9.5, 36, 2)
     assert (row["actors"], row["rollouts_rejected"], row["policy_lag_max"]) == (1, 3, 2)
 
 
 def test_first_row_omits_unknown_values() -> None:
-    row = metrics_row(RunCounters(3), joined_fleet(), {}, {}, 0.0)
+    row = RunReporter(run_context(), UserMetrics()).row(learner_with({}), 0.0)
     assert set(row) < set(COLUMNS)
     assert "episode_return_mean" not in row
 
@@ -133,7 +140,8 @@ def test_status_contains_the_run_and_each_actor() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     spec = run_spec(algorithm="a3c", env_steps=1000)
     health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0, certificate_days_left=lambda: 7.5)
-    status = run_status("run", EPOCH, spec, counters, fleet, {}, health, 77, 25.0)
+    context = run_context(spec, Path("run"), counters=counters, fleet=fleet, health=health)
+    status = RunReporter(context, UserMetrics()).status(77, 25.0)
     assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
     assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
     assert (status.episode_return_mean, status.env_steps_per_second) == (4.0, 0.0)
@@ -187,26 +195,33 @@ def test_measure_sets_the_rate_of_each_actor() -> None:
 def test_summary_is_json_and_contains_bytes_per_env_step() -> None:
     counters = trained_counters(4.0)
     counters.seconds_to_target = 3.5
-    spec = run_spec(algorithm="a3c", seed=4)
-    made = summary("run", spec, counters, finished=True, wall_seconds=4.5, env_steps_per_second=4.0)
+    context = run_context(run_spec(algorithm="a3c", seed=4), counters=counters)
+    made = RunReporter(context, UserMetrics()).summary(finished=True, now=4.5)
     assert json.loads(json.dumps(made)) == made
     assert made["rollout_bytes_per_env_step"] == 10.0
     assert (made["solved"], made["seconds_to_target"], made["seed"]) == (True, 3.5, 4)
     assert (made["policy_lag_mean"], made["policy_lag_max"], made["episode_return_mean"]) == (2.0, 2, 4.0)
-    empty = summary("run", spec, RunCounters(3), finished=False, wall_seconds=0.0, env_steps_per_second=0.0)
-    assert empty["rollout_bytes_per_env_step"] == 0.0
-    assert (empty["solved"], empty["seconds_to_target"], empty["episode_return_mean"]) == (False, None, None)
 
 
-def test_distributions_come_every_ten_seconds_and_with_the_last_row(tmp_path: Path) -> None:
-    spec = run_spec()
-    state, learner = RunState(tmp_path, spec, 0.0), Learner(spec.training, POLICY, SPACES)
-    reporter = RunReporter(state, joined_fleet(), threading.Condition(), UserMetrics())
-    state.counters.returns.append(2.0)
+def test_summary_of_an_empty_run_does_not_divide_by_0() -> None:
+    context = run_context(started=0.0, health=HEALTHY)
+    made = RunReporter(context, UserMetrics()).summary(finished=False, now=0.0)
+    assert made["rollout_bytes_per_env_step"] == 0.0
+    assert (made["solved"], made["seconds_to_target"], made["episode_return_mean"]) == (False, None, None)
+
+
+def test_distributions_come_every_ten_seconds_and_with_the_last_row() -> None:
+    context, recorded = run_context(), list[Details]()
+    learner = Learner(context.spec.training, POLICY, SPACES)
+    recorder: Any = SimpleNamespace(record=lambda row, details: recorded.append(details))
+    reporter = RunReporter(context, UserMetrics())
+    reporter.begin(recorder, 0.0)
+    context.counters.returns.append(2.0)
     counted = []
     for now, last in ((0.5, False), (1.0, False), (10.4, False), (10.5, False), (11.0, False), (11.5, True)):
         learner.step([make_rollout(valid=EVERYTHING)], 0.0)
-        details = reporter.details(learner, now, last=last)
-        counted.append(sum(details.action_counts.get("action", ())))
-        assert list(details.returns) == ([2.0] if counted[-1] else [])
+        context.counters.lengths.append(7)
+        reporter.record(learner, now, last=last)
+        counted.append(sum(recorded[-1].action_counts.get("action", ())))
+        assert list(recorded[-1].returns) == ([2.0] if counted[-1] else [])
     assert counted == [18, 0, 0, 3 * 18, 0, 2 * 18]

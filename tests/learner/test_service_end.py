@@ -16,8 +16,8 @@ from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.config import ActorConfig
 from daedalus.learner.reporting import recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
-from daedalus.learner.run import health, heartbeat
-from daedalus.learner.serving import actor_server, query_responses
+from daedalus.learner.run import heartbeat
+from daedalus.learner.serving import actor_server, run_context, waiting_requests
 from daedalus.learner.training import checkpointer
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.policy.saving.saved_policy import checkpoints
@@ -124,7 +124,7 @@ def test_last_checkpoint_is_saved_although_the_last_metrics_fail(
     def fail(*_: object, last: bool) -> None:
         raise ZeroDivisionError("a bug in a diagnostic of the user's algorithm")
 
-    monkeypatch.setattr(RunReporter, "details", fail)
+    monkeypatch.setattr(RunReporter, "row", fail)
     learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
     actor = GatedActor(network, "actor")
     actor.open_gate()
@@ -184,8 +184,8 @@ def test_training_goes_on_and_a_learner_ends_while_its_disk_does_not_answer(
     monkeypatch.setattr(checkpointer, "STOP_SECONDS", 0.1)
     monkeypatch.setattr(recorder, "_CLOSE_SECONDS", 0.1)
     monkeypatch.setattr(heartbeat, "_END_SECONDS", 0.1)
-    monkeypatch.setattr(health, "SLOW_DISK_SECONDS", 0.0)
-    monkeypatch.setattr(query_responses, "_ANSWER_SECONDS", 0.05)
+    monkeypatch.setattr(run_context, "SLOW_DISK_SECONDS", 0.0)
+    monkeypatch.setattr(waiting_requests, "_ANSWER_SECONDS", 0.05)
     operator = MemoryTransport(network)
 
     def order() -> Acknowledgement:

@@ -1,13 +1,15 @@
 """The learner's process: the real actor server, and a loop that takes batches in place of training."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from daedalus.learner.run.counters import RunCounters, updates_of
 from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.run_context import RunContext
 from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.uploads import Upload
@@ -81,31 +83,25 @@ class LearnerProcess:
 
     def _main(self) -> None:
         """Do what daedalus.learner.service does."""
-        disk, counters = self.disk, RunCounters(100)
+        disk = self.disk
+        context = RunContext.begin(Path(RUN), self.settings.spec, self.stop, spaces=disk.spaces)  # type: ignore[arg-type]
+        context = replace(context, learner_epoch=self.epoch, start_version=disk.version)
+        counters = context.counters
         if disk.counters is not None:
             counters.restore(disk.counters)
         before = counters.rollouts_accepted, counters.rollouts_trained
-        server = self.server = ActorServer(
-            RUN,
-            self.settings.spec,
-            self.link,
-            counters,
-            _no_status,
-            learner_epoch=self.epoch,
-            start_version=disk.version,
-            spaces=disk.spaces,
-        )
+        server = self.server = ActorServer(context, self.link, _no_status)
         observe(server, self.ledger, self.life)
         try:
             server.open()
             if disk.spaces is None:
-                server.await_actor(self.stop)  # type: ignore[arg-type] - a simulated Event
-            disk.spaces = server.fleet.spaces
+                server.await_actor()  # type: ignore[arg-type] - a simulated Event
+            disk.spaces = server.context.fleet.spaces
             if disk.spaces is not None:
                 self._train(server, counters, before)
                 server.close("finished" if self.is_finished else "stopped", finished=self.is_finished)
                 if self.is_finished:
-                    server.await_departures(self.stop)  # type: ignore[arg-type]
+                    server.await_departures()  # type: ignore[arg-type]
         except TransportError as error:
             self.kernel.log("failed", self.process.name, str(error))
         finally:
@@ -143,7 +139,7 @@ class LearnerProcess:
         return updates_of(self.settings.spec.training, rollouts, memory=False)
 
     def _check(self, server: ActorServer, counters: RunCounters, before: tuple[int, int]) -> None:
-        with server.lock:
+        with server.context.lock:
             waiting = len(server.rollouts._buffer._waiting)  # type: ignore[attr-defined]
             accepted, trained = counters.rollouts_accepted - before[0], counters.rollouts_trained - before[1]
             self.ledger.check_counts(self.life, accepted, trained, waiting)

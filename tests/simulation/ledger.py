@@ -163,7 +163,7 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
     def noted_decide(sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
         verdict = decide(sender, content, policy_version, now)
         if isinstance(content, Rollout):
-            ledger.judged(life, content, verdict, server.fleet.actors[sender].incarnation)
+            ledger.judged(life, content, verdict, server.context.fleet.actors[sender].incarnation)
         return verdict
 
     def noted_add(rollout: Rollout) -> None:

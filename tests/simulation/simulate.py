@@ -129,7 +129,7 @@ def _await_progress(world: World) -> float:
     while True:
         late = [name for name in world.actors if freshest.get(name, -1.0) <= began]
         server = None if world.learner.done else world.learner.server
-        live = frozenset[str]() if server is None else server.fleet.live
+        live = frozenset[str]() if server is None else server.context.fleet.live
         taken = kernel.now - began
         if not late and live == world.actors.keys():
             return taken
@@ -155,7 +155,7 @@ def _end(world: World) -> None:
     kernel, learner = world.kernel, world.learner
     world.supervised = False
     if world.settings.ends_by == "finish":
-        fleet = {} if learner.server is None else learner.server.fleet.actors
+        fleet = {} if learner.server is None else learner.server.context.fleet.actors
         joined = [actor for actor in world.running if fleet[actor.name].incarnation == actor.incarnation]
         learner.is_finished = world.ledger.is_finished = True
         end = kernel.now + _END_SECONDS

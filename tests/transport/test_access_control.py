@@ -12,7 +12,7 @@ from certificates import change_certificates, issue_expired, make_certificates, 
 from routers import listen_somewhere
 
 from daedalus.cli.commands.router import router
-from daedalus.learner.serving.session_watchdog import LOOK
+from daedalus.learner.serving.actor_server import LOOK
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CredentialsError, load, with_remedy
 from daedalus.transport.interface import RefusedError, Transport, TransportError

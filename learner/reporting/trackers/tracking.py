@@ -4,20 +4,107 @@ metrics.csv is the queue between the learner and the tracker: the learner never 
 tracker does not answer.
 """
 
+import csv
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Self
 
-from daedalus.learner.reporting.metrics_rows import GROUPS, Details
-from daedalus.learner.reporting.trackers.metrics_follower import MetricsFollower
-from daedalus.learner.reporting.trackers.tracker import OpenTracker, TrackedRun, Tracker, flat
-from daedalus.learner.reporting.trackers.tracking_state import TrackingState
-from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY, read_json
+from daedalus.learner.reporting.metrics_rows import GROUPS, Details, numbers
+from daedalus.learner.reporting.trackers.tracker import TRACKERS, OpenTracker, TrackedRun, Tracker, flat
+from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY, TRACKER, read_json, write_json
 from daedalus.learner.run.settings import SettingsError, read_settings
+
+
+@dataclass(slots=True, kw_only=True)
+class TrackingState:
+    """State of one tracker between two processes."""
+
+    id: str = ""  # the tracker's id of the run; empty before the first start
+    rows: int = 0  # rows of metrics.csv that need no further attention
+    env_steps: int = -1  # of the newest row that was logged
+
+    @classmethod
+    def load(cls, directory: Path, name: str) -> Self:
+        """Read the state of a tracker; a missing or damaged file is a new state."""
+        try:
+            content = read_json(_path(directory, name))
+            return cls(id=str(content["id"]), rows=int(content["rows"]), env_steps=int(content["env_steps"]))
+        except (SettingsError, KeyError, TypeError, ValueError):
+            return cls()
+
+    def save(self, directory: Path, name: str) -> None:
+        """Write the state. Raises OSError."""
+        write_json(_path(directory, name), asdict(self))
+
+
+def chosen_trackers(chosen: Sequence[str], directory: Path) -> Sequence[str]:
+    """Return the trackers of a run: those that the user has chosen, and those that have logged it before."""
+    return list(dict.fromkeys([*chosen, *(name for name in TRACKERS if _path(directory, name).exists())]))
+
+
+def _path(directory: Path, name: str) -> Path:
+    return directory / TRACKER.format(name)
+
+
+class MetricsFollower:
+    """Reader of the complete rows of a metrics.csv that grows. It keeps no file open between two calls.
+
+    If a row has new columns, the writer of the file writes it anew, with all rows so far. A resumed run writes it anew
+    without the rows after its checkpoint, and appends rows that begin again there.
+    """
+
+    def __init__(self, path: Path, taken: int = 0) -> None:
+        """Construct the reader. `taken` is the number of rows to leave out at the beginning."""
+        self._path = path
+        self.taken = taken  # number of rows that were read, and whose use has ended without an exception
+        self._header = b""
+        self._at = 0  # bytes, after the rows that were taken
+        self._last = b""  # line before there
+
+    @property
+    def exist(self) -> bool:
+        """Whether the learner has written to the file."""
+        return self._path.exists()
+
+    def rows(self) -> Iterator[dict[str, float]]:
+        """Yield the rows since those that were taken. A damaged row is empty. Raises OSError."""
+        if not self.exist:
+            return
+        with open(self._path, "rb") as file:
+            header = file.readline()
+            if not header.endswith(b"\n"):
+                return
+            if header != self._header or not self._is_at_last(file):
+                file.seek(len(header))
+                lines = [line for _, line in zip(range(self.taken), file, strict=False) if line.endswith(b"\n")]
+                self._header, self._at = header, len(header) + sum(map(len, lines))
+                self._last, self.taken = (lines or [header])[-1], len(lines)
+            columns = _cells(header)
+            file.seek(self._at)
+            while (line := file.readline()).endswith(b"\n"):
+                row = numbers(columns, _cells(line))
+                yield row if "env_steps" in row else {}
+                self.taken += 1
+                self._at += len(line)
+                self._last = line
+
+    def _is_at_last(self, file: BinaryIO) -> bool:
+        """Return whether the line before the position is still the one that was taken last."""
+        file.seek(self._at - len(self._last))
+        return file.read(len(self._last)) == self._last
+
+
+def _cells(line: bytes) -> list[str]:
+    try:
+        return next(csv.reader([line.decode("utf-8", "replace")]), [])
+    except csv.Error:
+        return []
+
 
 _POLL_SECONDS = 1.0
 _RETRY_SECONDS = 60.0  # after the tracker failed
