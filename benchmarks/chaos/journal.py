@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable
 from typing import Any, cast
 
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.protocol.codec import decode

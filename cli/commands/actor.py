@@ -16,8 +16,8 @@ from dataclasses import replace
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError, NoLearnerError
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import (

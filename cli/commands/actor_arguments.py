@@ -3,8 +3,7 @@
 import argparse
 import secrets
 
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.own_name import own_name
+from daedalus.actor.session.actor_config import ActorConfig, own_name
 from daedalus.cli.arguments import add_allow_module, add_connect, add_tls, command_parser, seconds
 from daedalus.cli.logs import add_logging
 from daedalus.policy.user_modules import UserModules

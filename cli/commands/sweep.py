@@ -75,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--sampler",
         action="store_true",
-        help="let Optuna choose the values, in place of all combinations (needs the extra sweep)",
+        help="let Optuna choose the values, in place of all combinations (needs the extra analysis)",
     )
     options.add_argument(
         "--trials", type=_count, metavar="N", help="number of settings that --sampler tries (default: 20)"
