@@ -22,7 +22,7 @@ from daedalus.analysis.run_groups import Group, select, short
 from daedalus.analysis.statistics import interquartile_mean
 from daedalus.analysis.sweep_plan import PlannedRun, has_begun, is_done
 from daedalus.analysis.sweep_search import Search
-from daedalus.cli.supervisor import stop
+from daedalus.launch.supervision import stop
 from daedalus.learner.run.run_directory import METRICS, SUMMARY, read_json, remove_failed
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.settings import SettingsError

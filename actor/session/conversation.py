@@ -90,7 +90,7 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Subscribe:
-    """Pass on the values of a key, from now on."""
+    """Pass on the values of a key, from now on. Idempotent, as the next three."""
 
     key: str
 

@@ -179,15 +179,16 @@ class SessionThread:
                 if key not in self._inboxes:
                     self._inboxes[key] = self._transport.subscribe(key, self._on_news)
             case Unsubscribe(key):
-                self._inboxes.pop(key).close()
+                if key in self._inboxes:
+                    self._inboxes.pop(key).close()
             case WatchPresence(key):
                 if key not in self._declared:
-                    self._declared.add(key)
                     self._transport.watch_presence(key, self._on_presence)
+                    self._declared.add(key)
             case DeclarePresence(key):
                 if key not in self._declared:
-                    self._declared.add(key)
                     self._transport.declare_presence(key)
+                    self._declared.add(key)
 
     def _on_news(self) -> None:
         self.notify(lambda: None)

@@ -219,8 +219,9 @@ class SnapshotFeed:
     def subscribe(self) -> None:
         """Receive every published snapshot from now on, unless compact snapshots are fetched. Idempotent."""
         key = keys.snapshots(self._conversation.run)
-        if self._compact is None and self._subscribed != key:
-            self._unsubscribe()
+        if self._compact is None:
+            if self._subscribed != key:
+                self._unsubscribe()
             self._subscribed = key
             self._conversation.act(Subscribe(key))
 

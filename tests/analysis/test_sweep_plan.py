@@ -17,7 +17,7 @@ from daedalus.analysis.sweep_plan import (
     split_values,
 )
 from daedalus.cli.commands.train import train_parser
-from daedalus.cli.settings_arguments import resolve_spec
+from daedalus.cli.settings_arguments import run_choice
 from daedalus.learner.run.run_directory import SUMMARY
 from daedalus.learner.run.settings import SettingsError
 
@@ -117,7 +117,7 @@ def test_the_command_line_of_a_run_gives_the_settings_that_are_planned(tmp_path:
     parsed = as_trained(second)
     assert parsed.run_dir == second.directory
     assert parsed.log == ["wandb", "mlflow"]
-    assert resolve_spec(parsed) == second.spec
+    assert run_choice(parsed).spec() == second.spec
     assert second.spec.training.seed == 4
     assert second.spec.training.env_steps == 5000
     assert second.spec.policy.hidden == (32,)
@@ -127,7 +127,7 @@ def test_the_command_line_of_a_run_gives_the_settings_that_are_planned(tmp_path:
 def test_an_algorithm_brings_the_settings_of_its_preset(tmp_path: Path) -> None:
     (run,) = planner(tmp_path).runs("a3c", {"training.algorithm": "a3c"}, [1])
     assert run.spec.collection.rollout_length == 16  # of the preset's for_algorithm table
-    assert resolve_spec(as_trained(run)) == run.spec
+    assert run_choice(as_trained(run)).spec() == run.spec
 
 
 def test_settings_that_are_not_valid_are_refused_before_any_run(tmp_path: Path) -> None:
