@@ -11,8 +11,8 @@ from daedalus.analysis.comparison import Estimate
 from daedalus.analysis.recorded_run import RecordedEvaluation, RunRecord
 from daedalus.analysis.run_groups import text
 from daedalus.analysis.statistics import interquartile_mean, stratified_bootstrap
-from daedalus.launch.confirmation import mean_interval
 from daedalus.learner.serving.events import RESTARTED, RESUMED, RecordedEvent
+from daedalus.learner.target_confirmation import mean_interval
 from daedalus.protocol.texts import short_number, without_secrets
 
 _REPETITIONS = 2000

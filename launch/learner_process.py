@@ -10,20 +10,19 @@ last checkpoint could not be saved exits with UNSAVED.
 import logging
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.confirmation import Confirmations
 from daedalus.launch.environment_check import expected_defaults, expected_spaces
-from daedalus.launch.final_evaluation import EvaluationFailedError
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
 from daedalus.launch.run_choice import NewRun, with_record
+from daedalus.launch.supervision import FailedError, stop, supervised_actor
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
@@ -47,6 +46,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome, Outputs
 from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.serving.run_context import RunContext
+from daedalus.learner.target_confirmation import Player
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import NetworkError, UserModules, allow_settings, allow_words, modules_of, shown_path
@@ -63,6 +63,7 @@ from daedalus.transport.credentials import (
     credentials_to_listen,
 )
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.private_address import private_address
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -71,8 +72,7 @@ _logger = logging.getLogger(__name__)
 
 LISTEN = "tcp/127.0.0.1:7447"
 
-_POLL_SECONDS = 0.05  # until a target that was reached is noticed
-_END_SECONDS = 4.0  # for the process that plays to end
+_PLAYER = "confirmation"  # name of the process that plays the new episodes
 
 REACHED, NOT_REACHED = 0, 3
 _FAILURES = (
@@ -136,7 +136,6 @@ class LearnerOptions:
     prepared: Path | None = None  # the run directory
     spaces: Spaces | None = None
     rows_to: int | None = None  # pipe for each row of metrics
-    confirms: bool = False  # play new episodes when the target is reached
     supervised: bool = False
 
 
@@ -267,15 +266,14 @@ class LearnerProcess:
         stack.callback(transport.close)
         run = run if run.exists else self._with_directory(run, stack)
         try:
-            service = self._service(run, transport, restored, initial, spaces)
+            say = self._progress.say
+            output = stack.enter_context(ChildOutput(run.directory / run_directory.OUTPUT, say, say))
+            player = partial(self._player, run, output)
+            beginning = self._beginning(run, restored, initial)
+            service = self._service(run, transport, beginning, spaces, player)
             self._announce(run)
             if options.prepared is None:  # else the launcher starts them
-                output = stack.enter_context(
-                    ChildOutput(run.directory / run_directory.OUTPUT, self._progress.say, self._progress.say)
-                )
                 self._start_trackers(run.directory, output, stack)
-                if _confirms(run.spec):
-                    self._start_confirmations(run, output, stack)
             outcome = service.run()
             if outcome.superseded_by is not None:
                 _note_superseded(run.directory, outcome.superseded_by)
@@ -291,31 +289,33 @@ class LearnerProcess:
         self._context["run"] = run_directory.run_name(lock.directory)
         return replace(run, directory=lock.directory)
 
-    def _service(
-        self,
-        run: ChosenRun,
-        transport: Transport,
-        restored: "Checkpoint | None",
-        initial: SavedPolicy | None,
-        spaces: Spaces | None,
-    ) -> LearnerService:
+    def _beginning(self, run: ChosenRun, restored: "Checkpoint | None", initial: SavedPolicy | None) -> Beginning:
         options = self._options
-        context = RunContext.begin(
-            run.directory, run.spec, self._stop, started=options.started, spaces=spaces, restored=restored
-        )
-        context.health.certificate_days_left = partial(certificate_days_left, self._credentials)
-        beginning = Beginning(
+        return Beginning(
             restored=restored,
             initial=initial,
             allows_other_spaces=options.new.other_spaces or allows_other_spaces(run.directory),
             reset_statistics=options.reset_statistics,
             modules=run.modules,
         )
+
+    def _service(
+        self,
+        run: ChosenRun,
+        transport: Transport,
+        beginning: Beginning,
+        spaces: Spaces | None,
+        player: Callable[[], AbstractContextManager[Player]],
+    ) -> LearnerService:
+        options, restored = self._options, beginning.restored
+        context = RunContext.begin(
+            run.directory, run.spec, self._stop, started=options.started, spaces=spaces, restored=restored
+        )
+        context.health.certificate_days_left = partial(certificate_days_left, self._credentials)
         writers = _writers(run.directory, options.rows_to)
         outputs = Outputs(progress=self._progress, writers=writers, user_metrics=self._user_metrics)
         self._context["epoch"] = f"{context.learner_epoch:x}"
-        confirms = options.confirms or (options.prepared is None and _confirms(run.spec))
-        return LearnerService(context, transport, outputs, beginning, confirms=confirms)
+        return LearnerService(context, transport, outputs, beginning, open_player=player)
 
     def _with_spaces(self, run: ChosenRun) -> tuple[ChosenRun, Spaces | None]:
         """Return the run with the default settings of its spaces, and the spaces; None if they are not known here."""
@@ -351,31 +351,28 @@ class LearnerProcess:
             stack.callback(trackers.finish, self._stop)
             trackers.start()
 
-    def _start_confirmations(self, run: ChosenRun, output: ChildOutput, stack: ExitStack) -> None:
-        """Play new episodes here when the target is reached, as `daedalus train` does; `stack` ends them.
+    @contextmanager
+    def _player(self, run: ChosenRun, output: ChildOutput) -> Iterator[Player]:
+        """Yield an evaluator of this host, for the new episodes that confirm the target. Raises TransportError."""
+        needed = modules_of(run.spec.environment.user_modules)
+        allowed = allow_words(module for module in needed if module in run.modules.allowed)
+        options = (*self._options.log.words(), *allowed, "--evaluator")
+        with private_address() as address, closing(listen([address])) as transport:
+            process = supervised_actor(_PLAYER, address, options, output.pipes, output.last_error)
 
-        Only what actors report says that it is reached. Where the environment cannot be made, that counts.
-        """
-        allowed = allow_words(
-            module for module in modules_of(run.spec.environment.user_modules) if module in run.modules.allowed
-        )
-        options = [*self._options.log.words(), *allowed]
-        confirmations, ended = Confirmations(run.directory, run.spec, options, output), threading.Event()
+            def failure() -> str:
+                try:
+                    restarted = process.check()
+                except FailedError as error:
+                    return str(error)
+                if restarted:
+                    _logger.warning("%s", restarted)
+                return ""
 
-        def play() -> None:
             try:
-                while not ended.wait(_POLL_SECONDS):
-                    confirmations.poll()
-            except EvaluationFailedError as error:  # the learner waits for a result that it cannot get
-                _logger.error("%s", error)
-                self._stop.set()
+                yield Player(transport, failure)
             finally:
-                confirmations.close()
-
-        thread = threading.Thread(target=play, name="confirmations", daemon=True)
-        thread.start()
-        stack.callback(thread.join, _END_SECONDS)
-        stack.callback(ended.set)
+                stop([process.process])
 
 
 def how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:
@@ -384,10 +381,6 @@ def how_to_join(listening: list[str], credentials: Credentials | None, spec: Run
     tls = ["--tls", "DIR"] if credentials else []
     command = ["daedalus actor --connect", address, *tls, *allow_settings(spec.actor_modules)]
     return " ".join([*command, *([f"(or at {', '.join(others)})"] if others else [])])
-
-
-def _confirms(spec: RunSpec) -> bool:
-    return spec.training.target_return is not None and spec.training.stop_when_solved
 
 
 def _writers(directory: Path, rows_to: int | None) -> list[OpenWriter]:

@@ -112,13 +112,11 @@ def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
     if run.insecure:
         arguments.append("--insecure")
     arguments += ["--started", repr(since), *run.logs.words(), *run.observer.learner_options]
-    arguments += allow_settings(run.spec.learner_modules)
+    arguments += allow_settings(run.spec.user_modules)  # with those of the environment, for the confirmation
     if run.spaces is not None:
         arguments += ["--spaces", run.spaces.model_dump_json()]
     if run.init_from is not None:
         arguments += ["--init-from", str(run.init_from)]
-    if run.spec.training.target_return is not None:
-        arguments.append("--confirm")
     if run.resume or not first:
         arguments.append("--resume")
     if run.reset_statistics and first:

@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from daedalus.launch.child_output import ChildOutput, OpenStreams, inherited
-from daedalus.launch.confirmation import Confirmations
 from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
 from daedalus.launch.local_run import (
     LocalRun,
@@ -18,7 +17,6 @@ from daedalus.launch.local_run import (
     RunStoppedError,
     UnsavedError,
     actor_arguments,
-    evaluation_arguments,
     gateway_arguments,
     learner_arguments,
     resume_command,
@@ -64,7 +62,6 @@ def train(
     """
     with _observed_address(run) as address:
         spec, options = run.spec, actor_arguments(run)
-        confirmations = Confirmations(run.directory, spec, evaluation_arguments(run), output)
         learner = _supervised_learner(run, address, learner_streams)
         actors: list[Supervised] = []
         try:
@@ -90,12 +87,11 @@ def train(
             if run.watch:
                 page.append(supervised_gateway(address, gateway_arguments(run), output.pipes))
             trackers.start()
-            return watch(learner, [*actors, *page], run, stopping, confirmations)
+            return watch(learner, [*actors, *page], run, stopping)
         finally:
             learner.process.terminate()
-            stop([*(actor.process for actor in actors), *confirmations.processes])
+            stop([actor.process for actor in actors])
             stop([learner.process], LEARNER_GRACE_SECONDS)  # where the disk is slow, it takes longer than the others
-            confirmations.close()
 
 
 @contextmanager
@@ -129,18 +125,11 @@ def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
         pass
 
 
-def watch(
-    learner: Supervised,
-    actors: list[Supervised],
-    run: LocalRun,
-    stopping: threading.Event,
-    confirmations: Confirmations,
-) -> int:
+def watch(learner: Supervised, actors: list[Supervised], run: LocalRun, stopping: threading.Event) -> int:
     """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
 
     The log shows each restart, and events.jsonl keeps it. Return 0 if the observer ends training, or UNSAVED. Raises
-    FailedError if the learner failed too often, or if too few actors are left; EvaluationFailedError if the result of a
-    confirmation cannot be saved.
+    FailedError if the learner failed too often, or if too few actors are left.
     """
     record = EventFile(run.directory)
     while not stopping.wait(_POLL_SECONDS):
@@ -151,7 +140,6 @@ def watch(
         if status is not None and (status in learner.ended or learner.failed_at_once):
             return status
         _warn(learner.check(), record)
-        confirmations.poll()
         for actor in list(actors):
             try:
                 _warn(actor.check(), record)

@@ -6,7 +6,8 @@ actors can join, because the import takes a second and the actors make their env
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ from daedalus.learner.run.settings import check_rollout_length, unmeasured_targe
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.events import EventFile
 from daedalus.learner.serving.run_context import RunContext
-from daedalus.learner.target_confirmation import TargetConfirmation
+from daedalus.learner.target_confirmation import Player, TargetConfirmation
 from daedalus.policy.user_modules import shown_path
 from daedalus.protocol.messages import RunStatus
 from daedalus.transport.interface import Transport
@@ -67,7 +68,7 @@ class LearnerService:
         outputs: Outputs,
         beginning: Beginning = NO_WEIGHTS,
         *,
-        confirms: bool = False,
+        open_player: Callable[[], AbstractContextManager[Player]] | None = None,
     ) -> None:
         """Construct the service.
 
@@ -76,14 +77,15 @@ class LearnerService:
           transport: the network; the caller closes it.
           outputs: where the metrics of the run go.
           beginning: what the policy begins with.
-          confirms: whether a launcher plays new episodes to confirm that the target is reached.
+          open_player: see TargetConfirmation; None: the newest returns decide alone that the target is reached.
         """
         self._context, self._outputs, self._beginning = context, outputs, beginning
         self._heartbeat = Heartbeat(context.directory)
         self._server = ActorServer(context, transport, self._status)
         self._confirmation = None
-        if confirms and context.spec.training.stop_when_solved:
-            self._confirmation = TargetConfirmation(context, self._heartbeat.beat)
+        if open_player is not None and context.spec.training.stop_when_solved:
+            beat = self._heartbeat.beat
+            self._confirmation = TargetConfirmation(context, self._server.publisher, open_player, beat)
         self._reporter = RunReporter(context, outputs.user_metrics)
 
     def run(self) -> Outcome:

@@ -1,39 +1,220 @@
-"""Confirmation of a target that was reached: the learner waits while its launcher plays new episodes."""
+"""Confirmation of a target that was reached: the learner waits while an evaluator plays new episodes.
+
+The mean of the newest training episodes reaches the target more probably in a lucky moment, and while they were played
+the policy changed. So their mean is too high on average, and the policy of that moment may be worse than those before.
+New sampled episodes with that policy show what it can do.
+
+The evaluator is a process that the launcher starts here. It has a transport of its own, which nobody else reaches: it
+needs no certificate, and no actor can report in its place.
+"""
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
-from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.serving.run_context import RunContext
-from daedalus.protocol.texts import exact_number, short_number
+from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
+from daedalus.learner.serving.waiting_requests import read_request
+from daedalus.policy.saving.best_checkpoints import is_best
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.limits import JOIN_LIMITS, Limits
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Join,
+    Refusal,
+    Welcome,
+)
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import bounded_text, exact_number, short_number
+from daedalus.transport.interface import Request, Transport, TransportError
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpointer import Checkpointer
+    from daedalus.learner.training.learner import Learner
 
+_CONFIDENCE = 0.95  # share of cases that an interval is to contain
 _POLL_SECONDS = 0.05
+_SEEDS = 2**34  # added to the seed of the run: no other evaluation of the run and no training uses these seeds
 
 _logger = logging.getLogger(__name__)
 
 
-class TargetConfirmation:
-    """The new episodes of one run, from the learner's side."""
+def confirmation(result: dict[str, Any], target: float) -> dict[str, Any]:
+    """Return the result of new episodes with two more entries.
 
-    def __init__(self, context: RunContext, beat: Callable[[], None]) -> None:
+    `interval` is the 95 % interval of the mean (None of one episode). `confirmed`: the mean itself reaches the target.
+    So a policy whose true mean is the target is confirmed in half of the attempts, one that is one standard error below
+    it in 16 of 100, and two in 2 of 100. The upper end of the interval would accept them in 98, 84 and 49 of 100.
+    """
+    interval = mean_interval(result["return_mean"], result["return_std"], result["episodes"])
+    return {**result, "interval": interval, "confirmed": result["return_mean"] >= target}
+
+
+def mean_interval(mean: float, std: float, count: int) -> tuple[float, float] | None:
+    """Return the 95 % interval of a mean over `count` values, or None for a single value.
+
+        mean +- t s / sqrt(n),  s^2 = n / (n - 1) std^2
+
+    with the 97.5 % quantile t of Student's distribution, n - 1 degrees of freedom.
+
+    Args:
+      mean, std: of the values; std is that of the values themselves, with n in the denominator.
+    """
+    if count < 2:
+        return None
+    error = _t_quantile(count - 1) * std / math.sqrt(count - 1)
+    return mean - error, mean + error
+
+
+def _t_quantile(freedom: int) -> float:
+    """Return the 97.5 % quantile of Student's t, to eight digits.
+
+    Up to 200 degrees of freedom that of the exact distribution, Abramowitz & Stegun (1964), equations 26.7.3 and
+    26.7.4; beyond, where its series is exact to ten digits, equation 26.7.5.
+    """
+    if freedom <= 200:
+        low, high = 0.0, math.pi / 2
+        while (angle := (low + high) / 2) not in (low, high):
+            low, high = (angle, high) if _t_within(angle, freedom) < _CONFIDENCE else (low, angle)
+        return math.sqrt(freedom) * math.tan(high)
+    z = NormalDist().inv_cdf((1.0 + _CONFIDENCE) / 2)
+    terms = (
+        z,
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+    )
+    return sum(term / freedom**power for power, term in enumerate(terms))
+
+
+def _t_within(angle: float, freedom: int) -> float:
+    """Return the probability that |t| is at most sqrt(freedom) tan(angle)."""
+    odd = freedom % 2
+    term, total = (math.cos(angle), 0.0) if odd else (1.0, 0.0)
+    for power in range(odd, freedom - 1, 2):
+        total += term
+        term *= math.cos(angle) ** 2 * (power + 1) / (power + 2)
+    if odd:
+        return 2 / math.pi * (angle + math.sin(angle) * total)
+    return math.sin(angle) * total
+
+
+def _result(spec: RunSpec, checkpoint: Path, report: EvaluationReport) -> dict[str, Any]:
+    """Return what summary.json has of new episodes, named as in a result of `daedalus evaluate`."""
+    returns = report.returns
+    return {
+        "environment": spec.environment.id,
+        "backend": spec.environment.backend,
+        "checkpoint": str(checkpoint),
+        "best_checkpoint": is_best(checkpoint),
+        "policy_version": report.policy_version,
+        "episodes": len(returns),
+        "notes": [bounded_text(report.note)] if report.note else [],
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "length_mean": float(report.lengths.mean()),
+        "seed": spec.training.seed + _SEEDS,
+        "actions": "sampled",
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Player:
+    """An evaluator that reaches `transport`, as nobody else does."""
+
+    transport: Transport
+    failure: Callable[[], str]  # why it has failed for good; empty as long as it may still play
+
+
+class PlayerError(Exception):
+    """The episodes cannot be played."""
+
+
+class _Conversation:
+    """What the learner says to the player, on the transport's threads: what to play, and with which policy."""
+
+    def __init__(self, context: RunContext, program: bytes, snapshot: bytes) -> None:
+        """`program` and `snapshot` are encoded messages."""
+        training = context.spec.training
+        self._run, self._program, self._snapshot = context.name, program, snapshot
+        self._welcome = encode(
+            Welcome(
+                run=context.name,
+                learner_epoch=context.learner_epoch,
+                seed=training.seed,
+                spec=context.spec.for_actors(),
+                confirm_episodes=training.target_episodes,
+                confirm_seed=training.seed + _SEEDS,
+            )
+        )
+        self._limits = Limits(max_bytes=16 * training.target_episodes + (1 << 10), max_arrays=2)
+        self.over = threading.Event()
+        self.report: EvaluationReport | None = None
+        self.failure = ""  # why there is no report
+
+    def open(self, transport: Transport) -> None:
+        """Start to answer the player."""
+        transport.serve(keys.program(self._run, "*"), lambda request: request.reply(self._program))
+        transport.serve(keys.evaluations(self._run, "*"), self._on_evaluation)
+        transport.serve(keys.join(self._run, "*"), self._on_join)
+
+    def _on_join(self, request: Request) -> None:
+        message = read_request(request.payload, JOIN_LIMITS, Join)
+        if isinstance(message, Join) and message.failure:
+            self.failure = bounded_text(message.failure)
+            self.over.set()
+            message = Refusal(code="failed", reason=self.failure)
+        request.reply(encode(message) if isinstance(message, Refusal) else self._welcome)
+
+    def _on_evaluation(self, request: Request) -> None:
+        message = read_request(request.payload, self._limits, EvaluationRequest, EvaluationReport)
+        match message:
+            case EvaluationRequest():
+                request.reply(self._snapshot)
+            case EvaluationReport():
+                self.report = message
+                self.over.set()
+                request.reply(encode(Acknowledgement(verdict="accepted")))
+            case Refusal():
+                request.reply(encode(message))
+
+
+class TargetConfirmation:
+    """The new episodes of one run."""
+
+    def __init__(
+        self,
+        context: RunContext,
+        publisher: SnapshotPublisher,
+        open_player: Callable[[], AbstractContextManager[Player]],
+        beat: Callable[[], None],
+    ) -> None:
         """Construct the confirmation.
 
         Args:
           context: the run; its newest returns are forgotten when the target is not confirmed.
+          publisher: has the program of the policy.
+          open_player: starts a player, and ends it. Raises TransportError or OSError.
           beat: called again and again during the wait, to show that this process works.
         """
-        self._context, self._file, self._beat = context, ConfirmationFile(context.directory), beat
+        self._context, self._publisher, self._open_player, self._beat = context, publisher, open_player, beat
         self._not_before = -math.inf  # of the next attempt, on the monotonic clock
         self.result: dict[str, Any] | None = None  # of the new episodes that confirmed the target
 
-    def confirm(self, policy_version: int, checkpointer: "Checkpointer") -> bool:
-        """Wait until the launcher has played new episodes with the present policy, and return whether they confirm it.
+    def confirm(self, learner: "Learner", checkpointer: "Checkpointer") -> bool:
+        """Wait until new episodes are played with the present policy, and return whether they confirm the target.
 
         If they do not, the newest returns are forgotten: the target has to be reached again, and training goes on for
         at least as long as the attempt has lasted: attempts take at most half of the time. Until then, nothing is
@@ -43,24 +224,24 @@ class TargetConfirmation:
         began = time.monotonic()
         if began < self._not_before:
             return False
-        if not checkpointer.wait(checkpointer.begin(), self._beat, patient=False):
+        saving = checkpointer.begin()  # a learner that is killed meanwhile continues from it, and asks again
+        if not checkpointer.wait(saving, self._beat, patient=False):
             return not self._context.stop.is_set()  # when a stopped run is resumed, it asks again
-        training = self._context.spec.training
+        training, version = self._context.spec.training, learner.policy_version
         episodes = f"{training.target_episodes} new episodes"
         target = exact_number(training.target_return)
         text = f"target {target} reached: the policy of this moment plays {episodes} to confirm it"
-        self._context.events.add("target", text, cause=f"version {policy_version}")
+        self._context.events.add("target", text, cause=f"version {version}")
         try:
-            result = self._played_with(policy_version)
-        except OSError as error:
-            _logger.warning("the target cannot be confirmed: %s", error.strerror)
+            report = self._played_with(learner)
+        except (PlayerError, TransportError, OSError) as error:  # such as a simulator of which only one runs at a time
+            text = f"the target cannot be confirmed: {error}"
+            self._context.events.add("target", text, cause=f"result of version {version}")
             return True
-        if result is None:  # the run is stopped; when it is resumed, it asks again
+        if report is None:  # the run is stopped; when it is resumed, it asks again
             return False
-        if "failed" in result:  # such as a simulator of which only one runs at a time
-            text = f"the target cannot be confirmed: {result['failed']}"
-            self._context.events.add("target", text, cause=f"result of version {policy_version}")
-            return True
+        assert training.target_return is not None
+        result = confirmation(_result(self._context.spec, saving.directory, report), training.target_return)
         if result["confirmed"]:
             self.result = result
             return True
@@ -69,18 +250,22 @@ class TargetConfirmation:
         ended = time.monotonic()
         self._not_before = ended + (ended - began)
         text = f"not confirmed: return {short_number(result['return_mean'])}; training continues"
-        self._context.events.add("target", text, cause=f"result of version {policy_version}")
+        self._context.events.add("target", text, cause=f"result of version {version}")
         return False
 
-    def _played_with(self, policy_version: int) -> dict[str, Any] | None:
-        """Return the launcher's result, or None if the run is stopped first. Raises OSError."""
-        try:
-            self._file.ask(policy_version)
-            while (result := self._file.answered(policy_version)) is None and not self._context.stop.wait(
-                _POLL_SECONDS
-            ):
+    def _played_with(self, learner: "Learner") -> EvaluationReport | None:
+        """Return the player's report, or None if the run is stopped first. Raises PlayerError and as `open_player`."""
+        snapshot = self._publisher.encoded(learner.policy_version, learner.weights())
+        conversation = _Conversation(self._context, self._publisher.program("*"), snapshot)
+        with self._open_player() as player:
+            conversation.open(player.transport)
+            while not conversation.over.wait(_POLL_SECONDS):
+                if self._context.stop.is_set():
+                    return None
+                if failure := player.failure():
+                    raise PlayerError(failure)
                 self._beat()
                 self._context.health.updated = time.monotonic()  # it works, although it does not train
-            return result
-        finally:
-            self._file.clear()
+        if conversation.report is None:
+            raise PlayerError(conversation.failure)
+        return conversation.report

@@ -144,8 +144,7 @@ class TrainingLoop:
         """Return whether the target is reached for the first time, and new episodes confirm it if they are played."""
         if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._context.spec):
             return False
-        confirmation, version = self._confirmation, self._learner.policy_version
-        return confirmation is None or confirmation.confirm(version, self._checkpointer)
+        return self._confirmation is None or self._confirmation.confirm(self._learner, self._checkpointer)
 
     def _update(self) -> None:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""

@@ -21,7 +21,7 @@ class Lucky(gymnasium.Env[Any, Any]):
     action_space = Discrete(2)
 
     def __init__(self, **_arguments: Any) -> None:
-        self._evaluated = Path(sys.argv[0]).name == "evaluate.py"
+        self._evaluated = Path(sys.argv[0]).name == "evaluate.py" or "--evaluator" in sys.argv
         self._unlucky = self._evaluated and UNLUCKY.exists()
         if self._evaluated and BUSY.exists():
             BUSY.unlink()

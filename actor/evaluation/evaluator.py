@@ -1,10 +1,13 @@
-"""The evaluator: an actor that evaluates the learner's newest policy on a schedule and reports the returns.
+"""The evaluator: an actor that evaluates the learner's newest policy and reports the returns.
+
+It does so on a schedule, or once, for a learner that waits for the confirmation of its target.
 
 It contributes nothing to the training data. The only threads are the caller's and the transport's.
 """
 
 import itertools
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -30,12 +33,14 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
+from daedalus.protocol.spec import EvaluatorSpec
 from daedalus.protocol.texts import short_number
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
 
 _DEFAULT_SECONDS = 60.0  # between evaluations, unless the run says otherwise
+_PROGRESS_SECONDS = 5.0  # between two log messages of the episodes that a learner waits for
 _UPDATE_SECONDS = 60.0  # for a query that is answered between two updates, which may be slow
 
 
@@ -84,7 +89,7 @@ class Evaluator:
         self._config, self._stop, self._on_join = config, stop, on_join
         self._session = EvaluatorSession(config, own_origin(transport))
         self._thread = SessionThread(self._session, transport, stop)
-        self._warned_of_cuts = False
+        self._warned_of_cuts, self._show_at = False, math.inf
 
     def run(self) -> bool:
         """Evaluate until `stop` or until the run is over; return whether the run finished.
@@ -105,29 +110,33 @@ class Evaluator:
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
         self._on_join(welcome)
-        spec = welcome.spec
-        interval = spec.evaluation.seconds or _DEFAULT_SECONDS
-        episodes = spec.evaluation.episodes
-        actions = spec.evaluation.actions
-        _logger.info(
-            "run %r: %d %s episodes of %s every %g s", welcome.run, episodes, actions, spec.environment.id, interval
-        )
+        spec, wanted, confirms = welcome.spec, welcome.spec.evaluation, welcome.confirm_episodes > 0
+        interval = wanted.seconds or _DEFAULT_SECONDS
+        if confirms:
+            wanted = wanted.model_copy(update={"episodes": welcome.confirm_episodes, "actions": "sampled"})
+        else:
+            plan = f"{wanted.episodes} {wanted.actions} episodes of {spec.environment.id} every {interval:g} s"
+            _logger.info("run %r: %s", welcome.run, plan)
         environment = spec.environment.as_evaluated()
-        count = environments_for(episodes, environment, spec.collection)
+        count = environments_for(wanted.episodes, environment, spec.collection)
         environments = make_environments(environment, count, modules=self._config.modules, one_episode=True)
         try:
-            due = time.monotonic() + interval
+            due = time.monotonic() + (0.0 if confirms else interval)
             for number in itertools.count():
                 self._thread.run(self._session.pause(due - time.monotonic()))
                 due = time.monotonic() + interval
                 # An actor's seed is made of other numbers: no episode of training is evaluated here.
                 seed = int(np.random.SeedSequence([welcome.seed, spec.seed, number]).generate_state(1)[0])
-                if not self._evaluate(welcome, environments, seed):
+                if confirms:
+                    seed, self._show_at = welcome.confirm_seed, time.monotonic() + _PROGRESS_SECONDS
+                if not self._evaluate(welcome, wanted, environments, seed):
                     return
+                if confirms:
+                    raise RunOverError("the new episodes are played", finished=True)
         finally:
             environments.close()
 
-    def _evaluate(self, welcome: Welcome, environments: VectorEnvironment, seed: int) -> bool:
+    def _evaluate(self, welcome: Welcome, wanted: EvaluatorSpec, environments: VectorEnvironment, seed: int) -> bool:
         """Request a policy, evaluate it and report; return False if the learner is gone."""
         snapshot = self._thread.run(self._session.request_snapshot())
         if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
@@ -137,7 +146,6 @@ class Evaluator:
             return False
         runtime = OnnxRuntime(program, self._stop)
         runtime.load(snapshot.weights)
-        wanted = welcome.spec.evaluation
         sampled = wanted.actions == "sampled"
         evaluation = play_episodes(
             runtime,
@@ -149,21 +157,29 @@ class Evaluator:
             progress=self._raise_if_ended,
         )
         _logger.info("policy version %d: return %s", snapshot.policy_version, short_number(evaluation.returns.mean()))
-        if evaluation.cut.any() and not self._warned_of_cuts:
-            self._warned_of_cuts = True
+        note = ""
+        if evaluation.cut.any():
             cut, longest = int(evaluation.cut.sum()), wanted.max_episode_env_steps
-            _logger.warning("%s", cut_note(cut, wanted.episodes, longest, sampled=sampled))
+            note = cut_note(cut, wanted.episodes, longest, sampled=sampled)
+            if not self._warned_of_cuts:
+                self._warned_of_cuts = True
+                _logger.warning("%s", note)
         report = EvaluationReport(
             evaluator=self._config.name,
             learner_epoch=snapshot.learner_epoch,
             policy_version=snapshot.policy_version,
             returns=evaluation.returns,
             lengths=evaluation.lengths,
+            note=note,
         )
         self._thread.run(self._session.report(report))
         return True
 
-    def _raise_if_ended(self, _finished: int, _mean: float) -> bool:
+    def _raise_if_ended(self, finished: int, mean: float) -> bool:
         """End an evaluation with the run or on `stop`, in the middle of an episode: called after every step."""
         self._thread.call(self._session.check_over)
+        if time.monotonic() >= self._show_at:
+            self._show_at += _PROGRESS_SECONDS
+            so_far = f", mean return {short_number(mean)}" if finished else ""
+            _logger.info("%d new episodes have ended%s", finished, so_far)
         return False

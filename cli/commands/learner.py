@@ -88,7 +88,6 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)
     options.add_argument("--no-progress", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--rows-to", type=int, help=argparse.SUPPRESS)
-    options.add_argument("--confirm", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--spaces", type=Spaces.model_validate_json, help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options
@@ -122,7 +121,6 @@ def learner_options(arguments: argparse.Namespace, started: float, here: Path) -
         started=arguments.started or started,
         spaces=arguments.spaces,
         rows_to=arguments.rows_to,
-        confirms=arguments.confirm,
         supervised=arguments.exit_with_parent,
     )
 

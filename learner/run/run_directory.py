@@ -7,7 +7,6 @@ learner.lock     locked by the learner that runs
 heartbeat        its age shows that the learner works (heartbeat.py)
 events.jsonl     what happened: actors that joined and left, rejections, restarts (event_file.py)
 evaluation.json  result of the final evaluation, with the return of each episode
-confirmation.json  only while the learner waits for the confirmation of a reached target (confirmation_file.py)
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 tracker-*.json   how far each tracker has logged the run
 """
@@ -36,7 +35,6 @@ from daedalus.protocol.spec import RunSpec
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
 OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
-CONFIRMATION = "confirmation.json"
 OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
 TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run
 _SUPERSEDED = "superseded_by"  # in summary.json: the epoch of the newer learner
@@ -161,7 +159,6 @@ def remove_failed(directory: Path) -> None:
         SUMMARY,
         f"{OUTPUT}*",
         EVENTS,
-        CONFIRMATION,
         LOCK,
         HEARTBEAT,
         OPERATOR_TOKEN,

@@ -267,14 +267,7 @@ class SnapshotPublisher:
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
         """Publish a snapshot. It is encoded once, for subscribers and for queries."""
-        snapshot = encode(
-            Snapshot(
-                learner_epoch=self._context.learner_epoch,
-                policy_version=policy_version,
-                program=self._program_hash,
-                weights={**weights, **self.extras()},
-            )
-        )
+        snapshot = self.encoded(policy_version, {**weights, **self.extras()})
         if not self._ended:
             self._snapshot = snapshot, policy_version
         self.version, self._unpublished_rollouts = policy_version, 0
@@ -282,6 +275,17 @@ class SnapshotPublisher:
             self._transport.publish(keys.snapshots(self._context.name), snapshot)
         self._context.fleet.pushed_bytes += len(snapshot)
         self._context.counters.snapshots_published += 1
+
+    def encoded(self, policy_version: int, weights: dict[str, np.ndarray]) -> bytes:
+        """Return an encoded Snapshot for the program on offer."""
+        return encode(
+            Snapshot(
+                learner_epoch=self._context.learner_epoch,
+                policy_version=policy_version,
+                program=self._program_hash,
+                weights=weights,
+            )
+        )
 
     def _count_answer(self, request: SnapshotRequest, size: int) -> None:
         """Count an answer to an actor. Any thread may call this method."""

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+from daedalus.launch.confirmation import Confirmations, confirmation, confirmation_arguments, mean_interval
+from daedalus.learner.run.confirmation_file import ConfirmationFile
 from processes import until
 
 from daedalus.cli.commands.evaluate import parser
 from daedalus.launch import confirmation as module
 from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.confirmation import Confirmations, confirmation, confirmation_arguments, mean_interval
-from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec, RunSpec, TrainingSpec

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from daedalus.launch.confirmation import Confirmations
 from processes import LIMIT, until
 
 from daedalus.launch import supervision
 from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.confirmation import Confirmations
 from daedalus.launch.local_run import LocalRun, RunObserver
 from daedalus.launch.local_training import watch
 from daedalus.launch.process_lifecycle import STOPPED, UNSAVED

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from counting_environment import Counting
+from daedalus.launch.confirmation import Confirmations
+from daedalus.learner.run.confirmation_file import ConfirmationFile
 from PIL import Image
 from processes import Running, processes_mentioning, until
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
@@ -22,10 +24,8 @@ from daedalus.analysis.recorded_run import read_record
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.commands.train import report as report_of
 from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.confirmation import Confirmations
 from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
 from daedalus.launch.local_run import LocalRun
-from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_directory import create, read_json, write_config, write_json
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy

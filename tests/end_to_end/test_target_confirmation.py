@@ -31,6 +31,11 @@ def summary(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "run" / "summary.json").read_text())
 
 
+def players(folder: Path) -> list[int]:
+    """Return the ids of the evaluators of the run in `folder`."""
+    return [pid for pid in processes_mentioning("--evaluator") if Path(f"/proc/{pid}/cwd").readlink() == folder]
+
+
 def test_training_continues_until_new_episodes_confirm_the_target(
     train: Callable[..., Running], tmp_path: Path
 ) -> None:
@@ -45,7 +50,6 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     assert (confirmation["confirmed"], confirmation["actions"], confirmation["episodes"]) == (True, "sampled", 10)
     assert confirmation["policy_version"] == result["updates"]  # the last one, at which training stopped
     assert result["episodes"] >= 20  # as many new training episodes as the target asks for, before the second attempt
-    assert not (tmp_path / "run" / "confirmation.json").exists()
     asked, refused, confirmed = (each.text for each in read_events(tmp_path / "run") if each.kind == "target")
     assert asked == confirmed == running.lines[first]
     assert refused == "not confirmed: return 0; training continues"
@@ -83,7 +87,7 @@ def test_run_that_is_stopped_during_the_confirmation_is_not_solved_and_resumes(
     (tmp_path / WAITING).touch()
     running = train()
     running.expect("target 1 reached: ")
-    until((tmp_path / "run" / "confirmation.json").exists)
+    until(lambda: players(tmp_path))
     running.process.terminate()
     assert running.wait() == 1, running.output
     stopped = summary(tmp_path)
@@ -100,7 +104,6 @@ def test_learner_that_crashes_during_the_confirmation_asks_again(train: Callable
     (tmp_path / WAITING).touch()
     running = train()
     running.expect("target 1 reached: ")
-    until((tmp_path / "run" / "confirmation.json").exists)
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     (victim,) = set(processes_mentioning("commands.learner")) & set(processes_mentioning(address))
     os.kill(victim, signal.SIGKILL)
@@ -110,3 +113,20 @@ def test_learner_that_crashes_during_the_confirmation_asks_again(train: Callable
     result = summary(tmp_path)
     assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
     assert result["confirmation"]["policy_version"] == result["updates"]
+
+
+def test_evaluator_that_is_killed_during_the_confirmation_plays_again(
+    train: Callable[..., Running], tmp_path: Path
+) -> None:
+    (tmp_path / WAITING).touch()
+    running = train()
+    running.expect("target 1 reached: ")
+    until(lambda: players(tmp_path))
+    (victim,) = players(tmp_path)
+    os.kill(victim, signal.SIGKILL)
+    running.expect("confirmation was killed by signal 9; started again")
+    (tmp_path / WAITING).unlink()
+    assert running.wait() == 0, running.output
+    result = summary(tmp_path)
+    assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
+    assert len([each for each in read_events(tmp_path / "run") if each.kind == "target"]) == 1
