@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.environment_check import expected_defaults, expected_spaces
+from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
 from daedalus.launch.run_choice import NewRun, with_record
@@ -356,7 +357,7 @@ class LearnerProcess:
         """Yield an evaluator of this host, for the new episodes that confirm the target. Raises TransportError."""
         needed = modules_of(run.spec.environment.user_modules)
         allowed = allow_words(module for module in needed if module in run.modules.allowed)
-        options = (*self._options.log.words(), *allowed, "--evaluator")
+        options = (*helper_log_words(self._options.log), *allowed, "--evaluator")
         with private_address() as address, closing(listen([address])) as transport:
             process = supervised_actor(_PLAYER, address, options, output.pipes, output.last_error)
 

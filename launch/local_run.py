@@ -127,7 +127,7 @@ def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
 def actor_arguments(run: LocalRun) -> tuple[str, ...]:
     """Return the arguments of this machine's actors and of the evaluator."""
     # The learner reports the progress of all actors: the records of each one are for debugging.
-    return *_of_helpers(run.logs), *allow_settings(run.spec.actor_modules)
+    return *helper_log_words(run.logs), *allow_settings(run.spec.actor_modules)
 
 
 def evaluation_arguments(run: LocalRun) -> list[str]:
@@ -140,9 +140,9 @@ def gateway_arguments(run: LocalRun) -> tuple[str, ...]:
     filming = [*allow_settings(run.spec.user_modules), "--checkpoints", str(run.directory)]
     camera = filming if run.camera else ["--no-camera"]
     token = ("--operator-token", str(run.directory / run_directory.OPERATOR_TOKEN))
-    return *_of_helpers(run.logs), *token, *camera, *([] if run.clients else ["--page-only"])
+    return *helper_log_words(run.logs), *token, *camera, *([] if run.clients else ["--page-only"])
 
 
-def _of_helpers(logs: LogOptions) -> list[str]:
-    """Return the options of actors and of the gateway, which prints its address at any level."""
+def helper_log_words(logs: LogOptions) -> list[str]:
+    """Return the options of actors, evaluators, and the gateway, which prints its address at any level."""
     return replace(logs, level="debug" if logs.level == "debug" else "warning").words()

@@ -54,6 +54,7 @@ class ScriptedLearner:
     def __init__(self, network: MemoryNetwork, spec: RunSpec, epoch: int = 1) -> None:
         self.transport = MemoryTransport(network)
         self.epoch, self.spec = epoch, spec
+        self.confirm_episodes, self.confirm_seed = 0, 0
         self.joins: queue.Queue[Join] = queue.Queue()
         self.received: queue.Queue[Request] = queue.Queue()
         self.present: list[str] = []
@@ -66,7 +67,15 @@ class ScriptedLearner:
         message = decode(request.payload, Limits())
         assert isinstance(message, Join)
         self.joins.put(message)
-        request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec.for_actors())))
+        welcome = Welcome(
+            run="r",
+            learner_epoch=self.epoch,
+            seed=1,
+            spec=self.spec.for_actors(),
+            confirm_episodes=self.confirm_episodes,
+            confirm_seed=self.confirm_seed,
+        )
+        request.reply(encode(welcome))
 
     def _program(self, request: Request) -> None:
         request.reply(encode(Program(hash=program_hash(MODEL), model=np.frombuffer(MODEL, np.uint8))))
@@ -104,6 +113,7 @@ class RunningEvaluator:
     def __init__(self, network: MemoryNetwork, timeout: float | None = None) -> None:
         self.stop = threading.Event()
         self.error: Exception | None = None
+        self.finished = False  # whether the evaluator has left because the run is over, or all is played
         config = ActorConfig(name="e", incarnation=7, timeout=timeout, modules=TEST_MODULES)
         self._evaluator = Evaluator(config, MemoryTransport(network), self.stop)
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -111,7 +121,7 @@ class RunningEvaluator:
 
     def _run(self) -> None:
         try:
-            self._evaluator.run()
+            self.finished = self._evaluator.run()
         except Exception as error:
             self.error = error
 

@@ -8,6 +8,7 @@ It contributes nothing to the training data. The only threads are the caller's a
 import itertools
 import logging
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -40,7 +41,7 @@ from daedalus.transport.interface import Transport
 _logger = logging.getLogger(__name__)
 
 _DEFAULT_SECONDS = 60.0  # between evaluations, unless the run says otherwise
-_PROGRESS_SECONDS = 5.0  # between two log messages of the episodes that a learner waits for
+_PROGRESS_SECONDS = 5.0  # between two lines about the episodes that a learner waits for
 _UPDATE_SECONDS = 60.0  # for a query that is answered between two updates, which may be slow
 
 
@@ -181,5 +182,6 @@ class Evaluator:
         if time.monotonic() >= self._show_at:
             self._show_at += _PROGRESS_SECONDS
             so_far = f", mean return {short_number(mean)}" if finished else ""
-            _logger.info("%d new episodes have ended%s", finished, so_far)
+            sys.stderr.write(f"confirmation: {finished} new episodes have ended{so_far}\n")
+            sys.stderr.flush()
         return False

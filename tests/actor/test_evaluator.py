@@ -58,6 +58,25 @@ def test_evaluator_samples_if_the_run_says_so(network: MemoryNetwork) -> None:
     assert seen - {0.0}
 
 
+def test_new_episodes_that_confirm_a_target_are_played_once_and_at_once(network: MemoryNetwork) -> None:
+    """Sampled ones of the seed that the learner names: each time the same."""
+    returns = []
+    for seed in (2**34 + 1, 2**34 + 1, 5):
+        learner = ScriptedLearner(network, run_spec(seconds=1000.0))
+        learner.confirm_episodes, learner.confirm_seed = 40, seed
+        evaluator = RunningEvaluator(network)
+        snapshot = learner.snapshot(3)
+        snapshot.weights["policy_head.bias"][:] = 0.0  # every action is as probable
+        learner.give(snapshot)
+        report = learner.receive_report()
+        evaluator.join()
+        assert evaluator.finished
+        assert (report.policy_version, len(report.returns), report.note) == (3, 40, "")
+        returns.append(report.returns.tolist())
+        learner.transport.close()
+    assert returns[0] == returns[1] != returns[2]
+
+
 def test_evaluated_episodes_are_not_cut_by_the_no_reward_limit(network: MemoryNetwork) -> None:
     """The first reward of the first episode is 0, at which training would cut it."""
     learner = ScriptedLearner(network, run_spec(no_reward_limit=1))

@@ -159,15 +159,15 @@ def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_
             process.kill()
 
 
-# A file system that does not answer holds the thread that reads the learner's question.
+# A file system that does not answer holds the thread that watches the processes.
 HUNG_DISK = """
     import sys, time
     from daedalus.cli.commands import train
-    from daedalus.learner.run.confirmation_file import ConfirmationFile
-    def asked(self):
+    from daedalus.learner.serving.events import EventFile
+    def hang(self, *_):
         print("reading", flush=True)
         time.sleep(1000)
-    ConfirmationFile.asked = asked
+    EventFile.__init__ = hang
     train._DISK_SECONDS = 0.2
     sys.exit(train.train(["cartpole", "--run-dir", sys.argv[1]]))
 """

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daedalus.launch.confirmation import Confirmations
 from processes import LIMIT, until
 
 from daedalus.launch import supervision
-from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.local_run import LocalRun, RunObserver
 from daedalus.launch.local_training import watch
 from daedalus.launch.process_lifecycle import STOPPED, UNSAVED
@@ -166,7 +164,6 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
 ) -> None:
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "training": {"algorithm": algorithm}})
     run = LocalRun(directory=tmp_path, spec=spec, started=0.0)
-    confirmations = Confirmations(tmp_path, spec, [], ChildOutput(tmp_path / "output.log", print, print))
     learner, actors = supervised(SLEEP), [supervised("raise SystemExit(7)") for _ in range(2)]
     evaluator = supervised("raise SystemExit(7)")
     evaluator.name = "evaluator"
@@ -174,7 +171,7 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
     try:
         failed = "all actors failed: see the error above" if continues else "worker failed 3 times"
         with pytest.raises(FailedError, match=failed):
-            watch(learner, [evaluator, *actors], run, threading.Event(), confirmations)
+            watch(learner, [evaluator, *actors], run, threading.Event())
         continued = "worker failed 3 times: see the error above; training continues without this process"
         assert any(continued in message for message in caplog.messages) == continues
     finally:
@@ -184,7 +181,6 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
 def test_training_that_has_finished_is_not_failed_by_actors_that_fail_at_its_end(tmp_path: Path) -> None:
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
     run = LocalRun(directory=tmp_path, spec=spec, started=0.0)
-    confirmations = Confirmations(tmp_path, spec, [], ChildOutput(tmp_path / "output.log", print, print))
     ready = tmp_path / "ready"
     learner = supervised(
         "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(3)); "
@@ -194,7 +190,7 @@ def test_training_that_has_finished_is_not_failed_by_actors_that_fail_at_its_end
     until(ready.exists)
     actor = supervised("raise SystemExit(7)")
     try:
-        assert watch(learner, [actor], run, threading.Event(), confirmations) == 3
+        assert watch(learner, [actor], run, threading.Event()) == 3
     finally:
         stop([learner.process, actor.process])
 
@@ -208,12 +204,11 @@ def test_training_that_a_callback_ended_is_not_evaluated_if_its_last_checkpoint_
 
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
     run = LocalRun(directory=tmp_path, spec=spec, started=0.0, observer=Ending())
-    confirmations = Confirmations(tmp_path, spec, [], ChildOutput(tmp_path / "output.log", print, print))
     learner = supervised(
         f"import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit({UNSAVED})); "
         f"open({str(tmp_path / 'ready')!r}, 'x'); {SLEEP}"
     )
     try:
-        assert watch(learner, [], run, threading.Event(), confirmations) == UNSAVED
+        assert watch(learner, [], run, threading.Event()) == UNSAVED
     finally:
         stop([learner.process])

@@ -15,6 +15,7 @@ import safetensors.numpy
 from processes import Running, listening_ports, processes_mentioning, starting, until
 from trackers import wandb_run
 
+from daedalus.launch.evaluation import evaluate
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.serving.events import read_events
 
@@ -90,8 +91,14 @@ def test_cartpole_is_solved_and_evaluated(solved: tuple[Path, str]) -> None:
     assert result["rollouts_rejected"] == {}
     assert result["snapshots_published"] == result["updates"] + 1
     assert "solved: mean return 475 reached" in output
-    assert result["confirmation"]["episodes"] == 100
-    assert result["confirmation"]["interval"][1] >= 475
+    confirmation = result["confirmation"]
+    assert confirmation["episodes"] == 100
+    assert confirmation["interval"][1] >= 475
+    seed = confirmation["seed"]
+    again = evaluate(confirmation["checkpoint"], actions="sampled", seed=seed, episodes=100)
+    assert seed not in (1, 1 + 2**32, 1 + 2**33)  # training, the final evaluation, the selection
+    assert (again.return_mean, again.return_std) == (confirmation["return_mean"], confirmation["return_std"])
+    assert again.policy_version == confirmation["policy_version"]
     assert "over 100 new sampled episodes of the policy at that moment, 95 % interval" in output
     assert "evaluation: return" in output
 
