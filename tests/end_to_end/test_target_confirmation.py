@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,11 @@ def summary(folder: Path) -> dict[str, Any]:
 
 def players(folder: Path) -> list[int]:
     """Return the ids of the evaluators of the run in `folder`."""
-    return [pid for pid in processes_mentioning("--evaluator") if Path(f"/proc/{pid}/cwd").readlink() == folder]
+    found = []
+    for pid in processes_mentioning("--evaluator"):
+        with suppress(FileNotFoundError):  # it has ended meanwhile
+            found += [pid] if Path(f"/proc/{pid}/cwd").readlink() == folder else []
+    return found
 
 
 def test_training_continues_until_new_episodes_confirm_the_target(
@@ -106,8 +111,11 @@ def test_learner_that_crashes_during_the_confirmation_asks_again(train: Callable
     running.expect("target 1 reached: ")
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     (victim,) = set(processes_mentioning("commands.learner")) & set(processes_mentioning(address))
+    until(lambda: players(tmp_path))
+    (orphan,) = players(tmp_path)
     os.kill(victim, signal.SIGKILL)
     until(lambda: running.output.count("target 1 reached: ") == 2)
+    until(lambda: orphan not in players(tmp_path))
     (tmp_path / WAITING).unlink()
     assert running.wait() == 0, running.output
     result = summary(tmp_path)
