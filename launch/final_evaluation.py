@@ -95,10 +95,6 @@ class EvaluationProcess:
         """The child process."""
         return self._process
 
-    def has_ended(self) -> bool:
-        """Return whether the process has ended, in any way."""
-        return self._process.poll() is not None
-
     def result(self) -> dict[str, Any]:
         """Return the result of a process that has ended. Raises EvaluationFailedError if it failed."""
         status = self._process.returncode
@@ -135,7 +131,7 @@ def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutp
         for arguments in commands:
             name = f"evaluation-{len(evaluations)}"
             evaluations.append(EvaluationProcess(arguments, name, output, shown=not evaluations))
-        while not all(evaluation.has_ended() for evaluation in evaluations):
+        while any(evaluation.process.poll() is None for evaluation in evaluations):
             if stopping.wait(_POLL_SECONDS):
                 raise EvaluationFailedError
         return [evaluation.result() for evaluation in evaluations]

@@ -10,8 +10,8 @@ last checkpoint could not be saved exits with UNSAVED.
 import logging
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -269,9 +269,7 @@ class LearnerProcess:
         try:
             say = self._progress.say
             output = stack.enter_context(ChildOutput(run.directory / run_directory.OUTPUT, say, say))
-            player = partial(self._player, run, output)
-            beginning = self._beginning(run, restored, initial)
-            service = self._service(run, transport, beginning, spaces, player)
+            service = self._service(run, transport, restored, initial, spaces, output)
             self._announce(run)
             if options.prepared is None:  # else the launcher starts them
                 self._start_trackers(run.directory, output, stack)
@@ -290,33 +288,31 @@ class LearnerProcess:
         self._context["run"] = run_directory.run_name(lock.directory)
         return replace(run, directory=lock.directory)
 
-    def _beginning(self, run: ChosenRun, restored: "Checkpoint | None", initial: SavedPolicy | None) -> Beginning:
+    def _service(
+        self,
+        run: ChosenRun,
+        transport: Transport,
+        restored: "Checkpoint | None",
+        initial: SavedPolicy | None,
+        spaces: Spaces | None,
+        output: ChildOutput,
+    ) -> LearnerService:
         options = self._options
-        return Beginning(
+        context = RunContext.begin(
+            run.directory, run.spec, self._stop, started=options.started, spaces=spaces, restored=restored
+        )
+        context.health.certificate_days_left = partial(certificate_days_left, self._credentials)
+        beginning = Beginning(
             restored=restored,
             initial=initial,
             allows_other_spaces=options.new.other_spaces or allows_other_spaces(run.directory),
             reset_statistics=options.reset_statistics,
             modules=run.modules,
         )
-
-    def _service(
-        self,
-        run: ChosenRun,
-        transport: Transport,
-        beginning: Beginning,
-        spaces: Spaces | None,
-        player: Callable[[], AbstractContextManager[Player]],
-    ) -> LearnerService:
-        options, restored = self._options, beginning.restored
-        context = RunContext.begin(
-            run.directory, run.spec, self._stop, started=options.started, spaces=spaces, restored=restored
-        )
-        context.health.certificate_days_left = partial(certificate_days_left, self._credentials)
         writers = _writers(run.directory, options.rows_to)
         outputs = Outputs(progress=self._progress, writers=writers, user_metrics=self._user_metrics)
         self._context["epoch"] = f"{context.learner_epoch:x}"
-        return LearnerService(context, transport, outputs, beginning, open_player=player)
+        return LearnerService(context, transport, outputs, beginning, open_player=partial(self._player, run, output))
 
     def _with_spaces(self, run: ChosenRun) -> tuple[ChosenRun, Spaces | None]:
         """Return the run with the default settings of its spaces, and the spaces; None if they are not known here."""

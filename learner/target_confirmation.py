@@ -175,7 +175,6 @@ class _Conversation:
         if isinstance(message, Join) and message.failure:
             self.failure = bounded_text(message.failure)
             self.over.set()
-            message = Refusal(code="failed", reason=self.failure)
         request.reply(encode(message) if isinstance(message, Refusal) else self._welcome)
 
     def _on_evaluation(self, request: Request) -> None:

@@ -120,7 +120,7 @@ class Scene:
         training = TrainingSpec(target_return=475.0, target_episodes=2, seed=7)
         spec = RunSpec(environment=EnvironmentSpec(id="A-v0"), training=training)
         self.context = RunContext.begin(directory, spec, threading.Event())
-        self.play, self.failure, self.opened = play, "", 0
+        self.play, self.starts, self.failure, self.opened = play, True, "", 0
         publisher = SnapshotPublisher(self.context, MemoryTransport(MemoryNetwork()))
         publisher.offer_program(b"program")
         self.confirmation = TargetConfirmation(self.context, publisher, self._player, beat=lambda: None)
@@ -130,6 +130,8 @@ class Scene:
     @contextmanager
     def _player(self) -> Iterator[Player]:
         self.opened += 1
+        if not self.starts:
+            raise TransportError("no display")
         network = MemoryNetwork()
         thread = threading.Thread(target=self._play, args=[MemoryTransport(network)])
         thread.start()
@@ -217,14 +219,7 @@ def test_target_counts_as_reached_if_the_episodes_cannot_be_played(tmp_path: Pat
 
     scene = Scene(tmp_path, play)
 
-    @contextmanager
-    def broken() -> Iterator[Player]:
-        raise TransportError("no display")
-        yield
-
-    if how == "does not start":
-        publisher = SnapshotPublisher(scene.context, MemoryTransport(MemoryNetwork()))
-        scene.confirmation = TargetConfirmation(scene.context, publisher, broken, beat=lambda: None)
+    scene.starts = how != "does not start"
     assert scene.confirm()
     assert scene.confirmation.result is None
     assert scene.texts[1:] == ["the target cannot be confirmed: no display"]
