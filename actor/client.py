@@ -29,9 +29,8 @@ import gymnasium
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session.config import ActorConfig, LinkChoice
-from daedalus.actor.session.own_name import own_name
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig, LinkChoice, own_name
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.protocol import keys
 from daedalus.protocol.messages import MAX_ENVIRONMENTS, ClientReport
 from daedalus.transport.connecting import connect_with_retry

@@ -10,7 +10,8 @@ import numpy as np
 from daedalus.analysis.comparison import Estimate
 from daedalus.analysis.recorded_run import RecordedEvaluation, RunRecord
 from daedalus.analysis.run_groups import text
-from daedalus.analysis.statistics import interquartile_mean, mean_interval, stratified_bootstrap
+from daedalus.analysis.statistics import interquartile_mean, stratified_bootstrap
+from daedalus.launch.confirmation import mean_interval
 from daedalus.learner.serving.events import RESTARTED, RESUMED, RecordedEvent
 from daedalus.protocol.texts import short_number, without_secrets
 

@@ -6,9 +6,7 @@ Scores are strata: one array for each task, whose first axis is the runs of that
 stratum. A score may be infinite, such as the time to a threshold of a run that never reached it.
 """
 
-import math
 from collections.abc import Callable, Sequence
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -135,52 +133,3 @@ def _improvements(samples: Strata) -> np.ndarray:
 
 def _better(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return (x > y) + 0.5 * (x == y)
-
-
-def mean_interval(mean: float, std: float, count: int) -> tuple[float, float] | None:
-    """Return the 95 % interval of a mean over `count` values, or None for a single value.
-
-        mean +- t s / sqrt(n),  s^2 = n / (n - 1) std^2
-
-    with the 97.5 % quantile t of Student's distribution, n - 1 degrees of freedom.
-
-    Args:
-      mean, std: of the values; std is that of the values themselves, with n in the denominator.
-    """
-    if count < 2:
-        return None
-    error = _t_quantile(count - 1) * std / math.sqrt(count - 1)
-    return mean - error, mean + error
-
-
-def _t_quantile(freedom: int) -> float:
-    """Return the 97.5 % quantile of Student's t, to eight digits.
-
-    Up to 200 degrees of freedom that of the exact distribution, Abramowitz & Stegun (1964), equations 26.7.3 and
-    26.7.4; beyond, where its series is exact to ten digits, equation 26.7.5.
-    """
-    if freedom <= 200:
-        low, high = 0.0, math.pi / 2
-        while (angle := (low + high) / 2) not in (low, high):
-            low, high = (angle, high) if _t_within(angle, freedom) < _CONFIDENCE else (low, angle)
-        return math.sqrt(freedom) * math.tan(high)
-    z = NormalDist().inv_cdf((1.0 + _CONFIDENCE) / 2)
-    terms = (
-        z,
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-    )
-    return sum(term / freedom**power for power, term in enumerate(terms))
-
-
-def _t_within(angle: float, freedom: int) -> float:
-    """Return the probability that |t| is at most sqrt(freedom) tan(angle)."""
-    odd = freedom % 2
-    term, total = (math.cos(angle), 0.0) if odd else (1.0, 0.0)
-    for power in range(odd, freedom - 1, 2):
-        total += term
-        term *= math.cos(angle) ** 2 * (power + 1) / (power + 2)
-    if odd:
-        return 2 / math.pi * (angle + math.sin(angle) * total)
-    return math.sin(angle) * total

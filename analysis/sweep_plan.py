@@ -3,11 +3,12 @@
 import hashlib
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, read_value
 from daedalus.policy.user_modules import allow_settings
@@ -132,15 +133,11 @@ class PlannedRun:
 class Planner:
     """Planner of runs in one folder."""
 
-    def __init__(self, folder: Path, settings: Callable[[Point, int], tuple[RunSpec, Sequence[str]]]) -> None:
-        """Construct the planner.
-
-        Args:
-          folder: of the sweep.
-          settings: returns the settings of a run, from its point and seed, and the words of the command line that
-            starts it, after `daedalus`. May raise SettingsError.
-        """
-        self._folder, self._settings = folder, settings
+    def __init__(
+        self, choice: RunChoice, trackers: Sequence[str], folder: Path, defaults: dict[str, Any] | None = None
+    ) -> None:
+        """Construct the planner. See RunChoice.spec for `defaults`."""
+        self._choice, self._trackers, self._folder, self._defaults = choice, trackers, folder, defaults
 
     def runs(self, name: str, point: Point, seeds: Sequence[int]) -> list[PlannedRun]:
         """Return the runs of a point, one for each seed.
@@ -149,14 +146,30 @@ class Planner:
         """
         runs = []
         for seed in seeds:
+            choice = _with_point(self._choice, point, seed)
             own = f"{name}_seed-{seed}" if name else f"seed-{seed}"
             directory = self._folder / own
-            spec, words = self._settings(point, seed)
-            words = (*words, "--run-dir", str(directory))
+            spec = choice.spec(self._defaults)
+            words = (*_words(choice, self._trackers), "--run-dir", str(directory))
             run = PlannedRun(name=own, point=point, seed=seed, directory=directory, spec=spec, words=words)
             _check_same(run)
             runs.append(run)
         return runs
+
+
+def _with_point(choice: RunChoice, point: Point, seed: int) -> RunChoice:
+    """Return the choice with the settings of a point."""
+    assignments = (*choice.assignments, *(f"{key}={value}" for key, value in point.items()))
+    return replace(choice, seed=seed, assignments=assignments)
+
+
+def _words(choice: RunChoice, trackers: Sequence[str]) -> list[str]:
+    words = ["train", *([choice.preset] if choice.preset is not None else [])]
+    for name in ("env", "algorithm", "actors", "seed", "env_steps", "wrap"):
+        value = getattr(choice, name)
+        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
+    words += [word for tracker in trackers for word in ("--log", tracker)]
+    return [*words, *(word for assignment in choice.assignments for word in ("--set", assignment))]
 
 
 def point_name(point: Point) -> str:

@@ -6,7 +6,7 @@ Prints "busy" when it starts to play. Part of learner_speed.py.
 import threading
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.cli.processes import exit_with_parent
+from daedalus.launch.process_lifecycle import exit_with_parent
 from daedalus.learner.run.settings import override, read_preset, run_spec
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime

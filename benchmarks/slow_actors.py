@@ -14,9 +14,9 @@ import sys
 import threading
 from pathlib import Path
 
-from daedalus.actor.session.config import ActorConfig, LinkChoice
-from daedalus.actor.session.service import ActorService
-from daedalus.cli.processes import exit_on_thread_exceptions, stop_on_signals
+from daedalus.actor.session.actor_config import ActorConfig, LinkChoice
+from daedalus.actor.session.actor_service import ActorService
+from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, stop_on_signals
 from daedalus.policy.user_modules import UserModules
 from daedalus.transport.connecting import connect_with_retry
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass, fields
 from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.actor.session.config import ActorConfig, LinkChoice
-from daedalus.actor.session.service import ActorService
-from daedalus.cli.processes import stop_on_signals
+from daedalus.actor.session.actor_config import ActorConfig, LinkChoice
+from daedalus.actor.session.actor_service import ActorService
+from daedalus.launch.process_lifecycle import stop_on_signals
 from daedalus.learner.run.settings import read_preset, run_spec
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode

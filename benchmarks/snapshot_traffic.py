@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
 from benchmarks.slow_actors import MODULE, provide_environment
-from daedalus.actor.session.config import LinkChoice
+from daedalus.actor.session.actor_config import LinkChoice
 from daedalus.protocol.messages import RunStatus
 
 _UNLIMITED = 1e12  # bytes per second

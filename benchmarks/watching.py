@@ -23,9 +23,9 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect as open_socket
 
 from benchmarks.screenshots import COMMAND, page_address
-from daedalus.cli.status_query import ask
 from daedalus.transport.connecting import connect
 from daedalus.transport.interface import Transport
+from daedalus.transport.status_query import ask
 
 SETTINGS = ["--set", "training.stop_when_solved=false", "--env-steps", "1000000000"]
 

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from daedalus.launch.logs import LEVELS, LogOptions
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_words
 
 
@@ -103,3 +104,19 @@ def _module(name: str) -> str:
     if re.fullmatch(r"\w+(\.\w+)*", name) is None or name.endswith(".py"):
         raise argparse.ArgumentTypeError(f"{name!r} is not the name of a module: write my_module, without :NAME or .py")
     return name
+
+
+def add_logging(options: argparse._ActionsContainer) -> None:
+    """Add --log-level and --log-json."""
+    options.add_argument(
+        "--log-level",
+        choices=LEVELS,
+        default="info",
+        help="lowest severity of log records shown (default: %(default)s)",
+    )
+    options.add_argument("--log-json", action="store_true", help="write log records as JSON, one object per line")
+
+
+def log_options(arguments: argparse.Namespace) -> LogOptions:
+    """Return what the options of `add_logging` choose."""
+    return LogOptions(level=arguments.log_level, as_json=arguments.log_json)

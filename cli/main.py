@@ -4,8 +4,8 @@ import os
 import sys
 
 from daedalus.cli.command_table import COMMANDS, USAGE
-from daedalus.cli.logs import say
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, interrupts_held
+from daedalus.launch.logs import say
+from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, interrupts_held
 
 
 def main() -> int:

@@ -1,51 +1,13 @@
-"""Options of a run's settings, which `daedalus train` and `daedalus learner` share, and the options of the learner."""
+"""Options of a run's settings, which `daedalus train`, `daedalus learner` and others share."""
 
 import argparse
-import copy
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from daedalus.cli.arguments import (
-    add_allow_module,
-    add_insecure,
-    add_reset_statistics,
-    add_tls,
-    command_parser,
-    whole_number,
-)
-from daedalus.cli.logs import add_logging
-from daedalus.cli.own_algorithm import with_record
+from daedalus.cli.arguments import whole_number
+from daedalus.launch.run_choice import NewRun, RunChoice
 from daedalus.learner.reporting.trackers.tracker import TRACKERS, tracker_name
-from daedalus.learner.run import run_directory
-from daedalus.learner.run.default_settings import default_settings
-from daedalus.learner.run.resuming import differing, fixed_changes
-from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
-from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.learner.run.settings import preset_names
 from daedalus.protocol.algorithms import ALGORITHMS
-from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
-
-LISTEN = "tcp/127.0.0.1:7447"
-
-DESCRIPTION = """\
-Owns the weights of a run. Receives rollouts from actors, trains on them, and publishes snapshots of the weights. Actors
-connect to a Zenoh router inside this process. With --connect, the learner uses another router instead."""
-
-EXAMPLES = """\
-examples:
-  daedalus learner cartpole
-  daedalus learner cartpole --actors 8 --algorithm impala --listen tcp/127.0.0.1:7447
-  daedalus learner --env Acrobot-v1 --set training.learning_rate=0.001 --run-dir runs/acrobot
-  daedalus learner cartpole --listen tls/0.0.0.0:7447 --tls certs/learner      (daedalus certs --help)
-  daedalus learner cartpole --connect tcp/router:7447
-  daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
-  daedalus learner --run-dir runs/mine --resume --env-steps 3000000      (the whole budget, with the steps already done)
-
-exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
-and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage;
-7 a newer learner of the run has taken over"""
 
 
 def add_settings(
@@ -131,18 +93,9 @@ def _tracker_name(name: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def resolve(arguments: argparse.Namespace, defaults: dict[str, Any] | None = None) -> tuple[RunSpec, Path]:
-    """Return the specification and the run directory that the arguments define. Raises SettingsError.
-
-    `defaults` are the settings that --env begins with; None: those for spaces that are not known.
-    """
-    spec = resolve_spec(arguments, defaults)
-    return spec, arguments.run_dir or named_directory(arguments.preset, spec)
-
-
-def resolve_spec(arguments: argparse.Namespace, defaults: dict[str, Any] | None = None) -> RunSpec:
-    """Return the specification that the arguments define. See resolve."""
-    chosen = Choice(
+def run_choice(arguments: argparse.Namespace) -> RunChoice:
+    """Return what the options of `add_settings` choose."""
+    return RunChoice(
         preset=arguments.preset,
         env=arguments.env,
         algorithm=arguments.algorithm,
@@ -150,178 +103,15 @@ def resolve_spec(arguments: argparse.Namespace, defaults: dict[str, Any] | None 
         env_steps=arguments.env_steps,
         actors=arguments.actors,
         wrap=arguments.wrap,
+        assignments=tuple(arguments.set),
     )
-    return chosen.spec(lambda settings: override(settings, arguments.set), defaults)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """A preset or an environment, and the most used settings, as a user chose them; None: not chosen."""
-
-    preset: str | None
-    env: str | None
-    algorithm: str | None
-    seed: int | None
-    env_steps: int | None
-    actors: int | None
-    wrap: str | None
-
-    def spec(self, change: Callable[[dict[str, Any]], None], defaults: dict[str, Any] | None = None) -> RunSpec:
-        """Return the specification.
-
-        Args:
-          change: applies further settings, in place.
-          defaults: settings that an environment begins with; None: those for spaces that are not known.
-
-        Raises SettingsError.
-        """
-        if self.preset is not None and self.env is not None:
-            raise SettingsError(f"leave out one of {self.preset} and --env {self.env}")
-        if self.preset is None and self.env is None:
-            raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
-        if self.preset is not None:
-            return run_spec(self._applied(read_preset(self.preset), change))
-        base = default_settings(None) if defaults is None else copy.deepcopy(defaults)
-        with_memory = base.pop("with_memory", {})
-        base.setdefault("environment", {})["id"] = self.env
-        settings = self._applied(copy.deepcopy(base), change)
-        if settings.get("policy", {}).get("memory", "none") != "none":
-            for section, values in with_memory.items():
-                base.setdefault(section, {}).update(values)
-            settings = self._applied(base, change)
-        return run_spec(settings)
-
-    def _applied(self, settings: dict[str, Any], change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-        """Return settings after the choices, which change them in place. Raises SettingsError."""
-        changed = copy.deepcopy(settings)
-        if self.algorithm is not None:
-            changed.setdefault("training", {})["algorithm"] = self.algorithm
-        change(changed)  # which may choose the algorithm, too
-        choose_algorithm(settings, changed.get("training", {}).get("algorithm"))
-        shortcuts = {
-            ("training", "seed"): self.seed,
-            ("training", "env_steps"): self.env_steps,
-            ("collection", "actors"): self.actors,
-            ("environment", "wrap"): self.wrap,
-        }
-        for (section, key), value in shortcuts.items():
-            if value is not None:
-                settings.setdefault(section, {})[key] = value
-        change(settings)
-        check_environment(self.env, settings)
-        return settings
-
-
-def check_environment(env: str | None, settings: dict[str, Any]) -> None:
-    """Check that other settings name no other environment than `env`. Raises SettingsError."""
-    if env is not None and (chosen := settings["environment"].get("id")) != env:
-        raise SettingsError(f"--env {env} and environment.id={chosen} are two environments: leave one of them out")
-
-
-def named_directory(preset: str | None, spec: RunSpec) -> Path:
-    """Return the default run directory, named after the preset or file, or after the environment.
-
-    A repeated config.toml of another run has no name of its own.
-    """
-    name = spec.environment.id if preset is None or Path(preset).name == run_directory.CONFIG else Path(preset).stem
-    return run_directory.default_directory(name, spec)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChosenRun:
-    """Run of a learner, as its command line defines it."""
-
-    spec: RunSpec
-    directory: Path
-    exists: bool  # whether the run directory was created before
-    changed: list[str]  # settings of a run that exists, which the command line changes
-    modules: UserModules  # that the learner may import
-
-
-def choose_run(arguments: argparse.Namespace) -> ChosenRun:
-    """Return the run that the arguments of `daedalus learner` define.
-
-    Modules that the command line itself names are allowed; those that only an existing config.toml names need
-    --allow-module. Raises SettingsError or UserModuleError.
-    """
-    if arguments.reset_statistics and not arguments.resume:
-        raise SettingsError("--reset-statistics needs --resume: a new run has no statistics")
-    named = arguments.preset is not None or arguments.env is not None
-    directory = arguments.prepared or (_directory_to_resume(arguments) if arguments.resume else None)
-    if directory is None:
-        spec, directory = resolve(arguments)
-        run_directory.check_free(directory)
-        changed = []
-    else:
-        before = run_directory.read_config(directory)
-        spec = _resumed_spec(before, arguments, directory)
-        changed = differing(before, spec)
-    own = modules_of(spec.user_modules) if named else []
-    modules = UserModules(frozenset({*arguments.allow_module, *own}), str(directory / run_directory.CONFIG))
-    modules.check(spec.learner_modules)  # the learner makes no environment
-    spec = with_record(spec, modules)
-    exists = (directory / run_directory.CONFIG).exists()
-    return ChosenRun(spec=spec, directory=directory, exists=exists, changed=changed, modules=modules)
-
-
-def _resumed_spec(before: RunSpec, arguments: argparse.Namespace, directory: Path) -> RunSpec:
-    """Return the specification of the run in `directory` with the settings that the command line changes.
-
-    A preset must be that of the run. Raises SettingsError.
-    """
-    config = str(directory / run_directory.CONFIG)
-    changes = argparse.Namespace(**{**vars(arguments), "preset": config, "env": None})
-    named = arguments.preset is not None or arguments.env is not None
-    # The settings that --env begins with depend on the environment, which need not be made for this.
-    spec = resolve_spec(arguments if named else changes, before.model_dump(mode="json", exclude_none=True))
-    other = fixed_changes(before, spec) or differing(resolve_spec(changes), spec)
-    if other:
-        raise SettingsError(
-            f"the run in {directory} has other settings ({', '.join(other)}): leave out PRESET, --env and all settings "
-            "to continue it, or name another --run-dir"
-        )
-    return spec
-
-
-def _directory_to_resume(arguments: argparse.Namespace) -> Path | None:
-    """Return the directory of a run that exists, or None if the run has to be started. Raises SettingsError."""
-    if arguments.run_dir is None:
-        raise SettingsError("--resume needs --run-dir DIR: name the directory of the run to start or to continue")
-    return arguments.run_dir if (arguments.run_dir / run_directory.CONFIG).exists() else None
-
-
-def learner_parser() -> argparse.ArgumentParser:
-    """Return the parser of `daedalus learner`."""
-    options = command_parser("learner", DESCRIPTION, EXAMPLES)
-    add_settings(options)
-    add_new_run(options)
-    addresses = options.add_mutually_exclusive_group()
-    addresses.add_argument(
-        "--listen", action="append", metavar="tcp/HOST:PORT", help=f"address where actors connect (default: {LISTEN})"
+def new_run(arguments: argparse.Namespace) -> NewRun:
+    """Return the run that the options of `add_settings` and `add_new_run` define."""
+    return NewRun(
+        choice=run_choice(arguments),
+        directory=arguments.run_dir,
+        init_from=arguments.init_from,
+        other_spaces=arguments.allow_other_spaces,
     )
-    addresses.add_argument(
-        "--connect",
-        action="append",
-        metavar="tcp/HOST:PORT",
-        help="address of a Zenoh router to use instead of the one inside this process",
-    )
-    options.add_argument(
-        "--resume",
-        action="store_true",
-        help="continue the run in --run-dir from its newest checkpoint, or start the run if there is none. "
-        "For a supervisor that repeats the same command. Another --env-steps or --set changes the run from then on",
-    )
-    add_reset_statistics(options, "with --resume: ")
-    add_allow_module(options, "config.toml of an existing run")
-    add_tls(options)
-    add_insecure(options)
-    add_logging(options)
-    # Options for `daedalus train`, which has created the run directory and its config.toml.
-    options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
-    options.add_argument("--started", type=float, help=argparse.SUPPRESS)
-    options.add_argument("--no-progress", action="store_true", help=argparse.SUPPRESS)
-    options.add_argument("--rows-to", type=int, help=argparse.SUPPRESS)
-    options.add_argument("--confirm", action="store_true", help=argparse.SUPPRESS)
-    options.add_argument("--spaces", type=Spaces.model_validate_json, help=argparse.SUPPRESS)
-    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
-    return options

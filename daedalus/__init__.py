@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
     from daedalus.actor.evaluation.video import VideoError
     from daedalus.analysis.recorded_run import read_metrics
-    from daedalus.cli.callbacks import Callback, TrainingRun
-    from daedalus.cli.evaluate_function import EvaluationResult, evaluate
-    from daedalus.cli.train_function import RunResult, TrainingError, train
+    from daedalus.launch.callbacks import Callback, TrainingRun
+    from daedalus.launch.evaluation import EvaluationResult, evaluate
+    from daedalus.launch.train_function import RunResult, TrainingError, train
     from daedalus.learner.run.run_files import RunDataError
     from daedalus.learner.run.settings import SettingsError
     from daedalus.policy.saving.hub import HubError
@@ -50,24 +50,24 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Callback": "daedalus.cli.callbacks",
+    "Callback": "daedalus.launch.callbacks",
     "Client": "daedalus.actor.client",
     "DamagedError": "daedalus.policy.saving.sealed",
     "EnvironmentSetupError": "daedalus.actor.environments.environment_errors",
-    "EvaluationResult": "daedalus.cli.evaluate_function",
+    "EvaluationResult": "daedalus.launch.evaluation",
     "HubError": "daedalus.policy.saving.hub",
     "NoPolicyError": "daedalus.policy.saving.saved_policy",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
     "RunDataError": "daedalus.analysis.recorded_run",
-    "RunResult": "daedalus.cli.train_function",
+    "RunResult": "daedalus.launch.train_function",
     "SettingsError": "daedalus.learner.run.settings",
-    "TrainingError": "daedalus.cli.train_function",
-    "TrainingRun": "daedalus.cli.callbacks",
+    "TrainingError": "daedalus.launch.train_function",
+    "TrainingRun": "daedalus.launch.callbacks",
     "VideoError": "daedalus.actor.evaluation.video",
-    "evaluate": "daedalus.cli.evaluate_function",
+    "evaluate": "daedalus.launch.evaluation",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
     "read_metrics": "daedalus.analysis.recorded_run",
-    "train": "daedalus.cli.train_function",
+    "train": "daedalus.launch.train_function",
 }
 
 

@@ -21,8 +21,8 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.classic_control import CartPoleEnv
 
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

@@ -9,8 +9,8 @@ import threading
 from pathlib import Path
 
 import daedalus
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run.run_directory import SUMMARY, create, read_json
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec

@@ -15,16 +15,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from daedalus.actor.session.origin import own_origin
-from daedalus.actor.session.upload_session import UploadSession
+from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_messages import Act, ClientError, Hello
 from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.client_uploads import ClientUploads, Outbox, Sender
-from daedalus.gateway.followed_run import FollowedRun
-from daedalus.gateway.joining import Joining, Seat
-from daedalus.gateway.learner_link import LearnerLink, NewestPolicy
+from daedalus.gateway.joining import FollowedRun, Joining, Seat
+from daedalus.gateway.learner_link import LearnerLink, LinkSession, NewestPolicy
 from daedalus.gateway.policy_versions import PolicyVersion, PolicyVersions
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Origin, Welcome
@@ -117,9 +115,10 @@ class Gateway:
         self._loop = asyncio.get_running_loop()
         self._stop = threading.Event()
         self._origin = own_origin(transport)
-        join = Join(actor=config.name, incarnation=secrets.randbits(62), origin=self._origin)
-        self._link = LearnerLink(transport, join, config.run, self._stop, self)
-        self._link.newest_version = lambda: self._newest_version
+        incarnation = secrets.randbits(62)
+        link = ActorConfig(name=config.name, incarnation=incarnation, run=config.run, any_run=True, link="lan")
+        self._link_session = LinkSession(link, self._origin)
+        self._link = LearnerLink(self._link_session, transport, self._stop, self)
         self._newest_version = -1  # that an acknowledgement mentioned
         self.run = FollowedRun()
         self._joining = Joining(transport, self._link, self.run)
@@ -213,8 +212,8 @@ class Gateway:
     def _new_actor(self, name: str, spaces: ClientSpaces, address: str) -> ClientActor:
         origin = Origin(host=self._origin.host, software=self._origin.software, address=address)
         join = Join(actor=name, incarnation=secrets.randbits(62), origin=origin)
-        uploads = UploadSession(self._sender, name, self._link.presence, self._link.lock)
-        return ClientActor(join, spaces, ClientUploads(join, self._sender, uploads, self._outbox.add))
+        uploads = ClientUploads(join, self._sender, self._link_session.heard, self._outbox.add)
+        return ClientActor(join, spaces, uploads)
 
     async def _enter(self, seat: Seat) -> None:
         """Join the learner, and wait for a policy of it."""
@@ -264,9 +263,16 @@ class Gateway:
             for seat in list(self._seats.values()):
                 self._send_due(seat.actor)
                 if seat.is_in(self.run.session) and not seat.is_joining:
-                    self._newest_version = max(self._newest_version, seat.actor.uploads.newest_version)
+                    self._mention(seat.actor)
                     self._obey(seat)
             self._adopt_policy()
+
+    def _mention(self, actor: ClientActor) -> None:
+        """Tell the link of the newest version that an acknowledgement mentioned."""
+        version = actor.uploads.newest_version
+        if version > self._newest_version:
+            self._newest_version = version
+            self._link.mention(actor.epoch, version)
 
     def _send_due(self, actor: ClientActor) -> None:
         actor.uploads.send_due()

@@ -7,17 +7,17 @@ import asyncio
 import contextlib
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
-from daedalus.actor.session.client_reports import ClientReports
-from daedalus.actor.session.upload_session import UploadSession
+from daedalus.actor.session.conversation import Query
+from daedalus.actor.session.uploading import Reports, Uploads
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Join, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
-from daedalus.transport.interface import OnAnswer, QuerySender, Transport, TransportError
+from daedalus.transport.interface import Transport, TransportError
 
 _MAX_FULL_ROLLOUTS = 8  # that wait for room in the window; beyond that the oldest is dropped
 
@@ -26,18 +26,23 @@ class ClientUploads:
     """What one client sends, to one learner epoch after the other."""
 
     def __init__(
-        self, join: Join, sender: QuerySender, uploads: UploadSession, on_rollout: Callable[["ClientUploads"], None]
+        self,
+        join: Join,
+        sender: "Sender",
+        on_heard: Callable[[float], None],
+        on_rollout: Callable[["ClientUploads"], None],
     ) -> None:
         """Construct the uploads.
 
         Args:
           join: names the actor and its incarnation.
-          sender: sends the reports.
-          uploads: sends the rollouts, until they are acknowledged.
+          sender: sends the rollouts, until they are acknowledged, and the reports.
+          on_heard: called with the time of each message of the learner.
           on_rollout: called when a rollout can be sent, by `send_one`.
         """
-        self._join, self._uploads, self._on_rollout = join, uploads, on_rollout
-        self._reports = ClientReports(sender, self._report)
+        self._join, self._sender, self._on_rollout = join, sender, on_rollout
+        self._uploads = Uploads(join.actor, on_heard)
+        self._reports = Reports(self._report)
         self._session: Welcome | None = None
         self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
         self._sequence = 0  # of the next rollout
@@ -53,7 +58,8 @@ class ClientUploads:
 
     def resume(self) -> None:
         """Go on with the same learner epoch after the network failed."""
-        self._uploads.resume()
+        with self._sender.lock:
+            self._uploads.resume()
 
     def keep(self, rollout: Rollout) -> None:
         """Send a rollout once there is room in the window."""
@@ -78,15 +84,25 @@ class ClientUploads:
             sequence=self._sequence,
             learner_epoch=session.learner_epoch,
         )
-        self._uploads.send(self._sequence, encode(replace(self._full.popleft(), identity=identity)))
+        payload = encode(replace(self._full.popleft(), identity=identity))
+        with self._sender.lock:
+            self._uploads.in_flight.add(self._sequence, payload)
         self._sequence += 1
+        self._send_rollouts()
 
     def send_due(self) -> None:
         """Send again what is due, and report what the status shows of the client."""
         if self._uploads.in_flight.rollouts:
-            self._uploads.send_due()
+            self._send_rollouts()
         if self._session is not None and (self.overridden_actions or self._dropped):
-            self._reports.send_if_due(self._session.run)
+            for query in self._reports.take_due(self._session.run, time.monotonic()):
+                self._sender.send(query)
+
+    def _send_rollouts(self) -> None:
+        with self._sender.lock:
+            queries = self._uploads.take_due(time.monotonic())
+        for query in queries:
+            self._sender.send(query)
 
     def _report(self) -> ClientReport:
         return ClientReport(
@@ -138,17 +154,12 @@ _MAX_QUERIES = 1 << 17  # that wait for the thread: the windows of 2,048 clients
 _POLL_SECONDS = 0.2  # how soon the thread notices `close` if the queue was full
 
 
-class _Query(NamedTuple):
-    """Arguments of one `query_async`."""
-
-    key: str
-    payload: bytes
-    timeout: float
-    on_answer: OnAnswer
-
-
 class Sender:
-    """A QuerySender: a queue of queries, which the thread sends in the order of the calls."""
+    """A queue of queries, which the thread sends in the order of the calls.
+
+    Attributes:
+      lock: is held while an answer is received, on the transport's threads. Hold it to change what answers change.
+    """
 
     def __init__(self, transport: Transport, on_failure: Callable[[Exception], None]) -> None:
         """Construct the sender.
@@ -158,8 +169,9 @@ class Sender:
           on_failure: called on the thread with an error of ours, which ends it.
         """
         self._transport, self._on_failure = transport, on_failure
-        self._queue: queue.Queue[_Query | None] = queue.Queue(_MAX_QUERIES)
+        self._queue: queue.Queue[Query | None] = queue.Queue(_MAX_QUERIES)
         self._closed = threading.Event()
+        self.lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
 
     def open(self) -> None:
@@ -174,14 +186,15 @@ class Sender:
         if self._thread.is_alive():
             self._thread.join(timeout)
 
-    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
-        """See QuerySender. `timeout` begins when the thread sends the query."""
-        if self._closed.is_set():
-            raise TransportError("the gateway stops")
+    def send(self, query: Query) -> None:
+        """Send a query, soon. Without room for it, or after `close`, there is no answer."""
         try:
-            self._queue.put_nowait(_Query(key, payload, timeout, on_answer))
+            if not self._closed.is_set():
+                self._queue.put_nowait(query)
+                return
         except queue.Full:
-            raise TransportError(f"{_MAX_QUERIES:,} queries wait for the link already: try again later") from None
+            pass
+        self._answer(query, None)
 
     def _run(self) -> None:
         try:
@@ -191,10 +204,16 @@ class Sender:
         except Exception as error:  # broad: any error of ours ends the gateway
             self._on_failure(error)
 
-    def _send(self, query: _Query | None) -> None:
+    def _send(self, query: Query | None) -> None:
         if query is None:
             return
         try:
-            self._transport.query_async(query.key, query.payload, timeout=query.timeout, on_answer=query.on_answer)
+            self._transport.query_async(
+                query.key, query.payload, timeout=query.timeout, on_answer=lambda data: self._answer(query, data)
+            )
         except TransportError:
-            query.on_answer(None)
+            self._answer(query, None)
+
+    def _answer(self, query: Query, data: bytes | None) -> None:
+        with self.lock:
+            query.on_answer(data, time.monotonic())

@@ -1,25 +1,93 @@
 """Lets clients take part in the run: requests to join its learner. For the gateway's event loop, with threads."""
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
-from daedalus.actor.errors import ActorError, NameInUseError
-from daedalus.actor.session.run_end import RunOverError
+from daedalus.actor.errors import ActorError, LearnerLostError
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.conversation import Ask, Conversation, DeclarePresence, RunOverError, Steps, Wait, Work
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_messages import ClientError
-from daedalus.gateway.followed_run import FollowedRun
 from daedalus.gateway.learner_link import LearnerLink
-from daedalus.gateway.presence import Presence
-from daedalus.protocol import keys
-from daedalus.protocol.messages import Join, Welcome
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.protocol.messages import Welcome
+from daedalus.transport.interface import Declaration, Transport, TransportError
+
+
+class Presence:
+    """Declares and withdraws the presence of one actor.
+
+    A congested link makes both wait. So one thread performs them for all actors, in the order of the calls.
+    """
+
+    def __init__(self, transport: Transport, thread: ThreadPoolExecutor) -> None:
+        """`thread` has one worker."""
+        self._transport, self._thread = transport, thread
+        self._key = ""  # that is declared; this and the next are the thread's
+        self._declaration: Declaration | None = None
+
+    async def declare(self, key: str) -> None:
+        """Be present under one key, and no other. Raises TransportError.
+
+        If the call is cancelled, the key may be declared all the same: call `withdraw`.
+        """
+        await asyncio.get_running_loop().run_in_executor(self._thread, self._declare, key)
+
+    def withdraw(self) -> None:
+        """Be present no longer. Returns at once."""
+        with contextlib.suppress(RuntimeError):  # the thread has ended: the transport withdraws it when it is closed
+            asyncio.get_running_loop().run_in_executor(self._thread, self._withdraw)
+
+    def _declare(self, key: str) -> None:
+        if self._key != key:
+            self._withdraw()
+            self._declaration = self._transport.declare_presence(key)
+            self._key = key
+
+    def _withdraw(self) -> None:
+        declaration, self._declaration, self._key = self._declaration, None, ""
+        if declaration is not None:
+            declaration.close()
+
+
+class FollowedRun:
+    """The learner of the run, and how the last run ended."""
+
+    def __init__(self) -> None:
+        self.session: Welcome | None = None  # of the learner that is followed
+        self.name = ""  # of the run that is or was followed
+        self.last_end = ""  # how the last run ended, until another begins
+        self.on_change: Callable[[], None] = lambda: None  # called when a learner was found, or a run has ended
+        self._changed = asyncio.Event()
+
+    def begin(self, session: Welcome) -> None:
+        """Follow a learner."""
+        self.session, self.name, self.last_end = session, session.run, ""
+        self.announce()
+        self.on_change()
+
+    def end(self, reason: str) -> None:
+        """Note that the run has ended."""
+        self.session, self.last_end = None, reason
+        self.on_change()
+
+    def announce(self) -> None:
+        """Wake those that wait for a change."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    async def change(self) -> None:
+        """Wait for another learner, or for a policy."""
+        await self._changed.wait()
+
 
 _THREADS = 16  # requests at the same time, which may wait
-_RETRY_SECONDS = 0.2  # between requests of one client
-_NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier gateway is dead
+_RETRY_SECONDS = 0.2  # how soon a client that joins notices that another learner is followed
 
 
 @dataclass(slots=True)
@@ -30,7 +98,6 @@ class Seat:
     on_end: Callable[[ClientError | str], None]  # ends its connection, with an error or how the run ended
     presence: Presence
     is_joining: bool = False
-    since: float = field(default_factory=time.monotonic)  # when it began to join
 
     def is_in(self, session: Welcome | None) -> bool:
         """Return whether the actor takes part in a session."""
@@ -66,40 +133,61 @@ class Joining:
 
     async def rejoin(self, seat: Seat) -> None:
         """Join a learner that has restarted, or that the network had lost; end the connection if that fails."""
-        seat.since = time.monotonic()
         try:
             await self.join(seat)
         except ClientError as error:
             seat.on_end(error)
 
     async def _join(self, seat: Seat, session: Welcome) -> bool:
-        """Ask the learner of a session again and again; return False once another learner is followed, or none."""
+        """Join the learner of a session; return False once another learner is followed, or none."""
         join, transforms = seat.actor.prepare(session.spec)
-        while session is self._run.session:
-            welcome = await self._ask(seat, session, join)
-            if welcome is not None:
-                seat.actor.joined(welcome, transforms)  # with the client's own epsilon
-                return True
-            if session is self._run.session:
-                await asyncio.sleep(_RETRY_SECONDS)
-        return False
-
-    async def _ask(self, seat: Seat, session: Welcome, join: Join) -> Welcome | None:
-        """Ask to join a learner; return its answer if the client now takes part in the newest session."""
-        began = time.monotonic()
-        request = self._link.queries.request_join
+        conversation = Conversation(ActorConfig(name=join.actor, incarnation=join.incarnation))
+        steps = conversation.confirm(session, join, asks_only=True)
         try:
-            await seat.presence.declare(keys.presence(session.run, join.actor, join.incarnation))
-            welcome = await asyncio.get_running_loop().run_in_executor(self._threads, request, session.run, join)
-        except NameInUseError as error:
-            if began > seat.since + _NAME_IN_USE_SECONDS:
-                raise ClientError("refused", str(error)) from None
-            return None
+            welcome = await self._perform(seat, session, conversation, steps)
+        except LearnerLostError:
+            self._link.look_again()
+            await asyncio.sleep(_RETRY_SECONDS)
+            return False
         except (ActorError, RunOverError, TransportError) as error:
             raise ClientError("refused", str(error)) from None
         if welcome is None or session is not self._run.session:
-            return None
-        if welcome.learner_epoch != session.learner_epoch:
-            self._link.look_again()
-            return None
-        return welcome
+            return False
+        seat.actor.joined(welcome, transforms)  # with the client's own epsilon
+        return True
+
+    async def _perform(
+        self, seat: Seat, session: Welcome, conversation: Conversation, steps: Steps[Welcome]
+    ) -> Welcome | None:
+        """Perform the actions of a client that joins; return the learner's answer, or None after another session."""
+        came: Any = None
+        while session is self._run.session:
+            conversation.now = time.monotonic()
+            try:
+                action = steps.send(came)
+            except StopIteration as end:
+                return end.value
+            for declaration in conversation.take_actions():
+                assert isinstance(declaration, DeclarePresence)
+                await seat.presence.declare(declaration.key)
+            came = await self._come_of(action)
+        return None
+
+    async def _come_of(self, action: Ask | Work | Wait) -> Any:
+        """Perform an action, and return what came of it."""
+        match action:
+            case Wait(until):
+                left = _RETRY_SECONDS if until is None else until - time.monotonic()
+                await asyncio.sleep(max(min(left, _RETRY_SECONDS), 0.0))
+                return None
+            case Work(call):
+                work: Callable[[], Any] = call
+            case Ask():
+                work = partial(self._ask, action)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, work)
+
+    def _ask(self, query: Ask) -> list[bytes]:
+        try:
+            return self._transport.query(query.key, query.payload, timeout=query.timeout)
+        except TransportError:
+            return []

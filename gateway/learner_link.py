@@ -2,31 +2,26 @@
 
 import logging
 import threading
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 from daedalus.actor.errors import ActorError, LearnerLostError
-from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
-from daedalus.actor.session.snapshot_feed import SnapshotFeed
-from daedalus.actor.session.state_lock import StateLock
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.conversation import RunOverError, Steps, WatchPresence
+from daedalus.actor.session.session_engine import PolicySession
+from daedalus.actor.session.session_thread import SessionThread
 from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.protocol import keys
-from daedalus.protocol.messages import Join, Snapshot, Welcome
+from daedalus.protocol.messages import Origin, Snapshot, Welcome
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 
 _logger = logging.getLogger(__name__)
 
-_TICK_SECONDS = 0.02
-_FIRST_PUSH_SECONDS, _MISSED_PUSH_SECONDS = 0.1, 1.0  # without the program or the first snapshot, ask again
-_SILENCE_SECONDS = 10.0  # without a message for so long, ask whether the learner is there
+_CONFIRM_SECONDS = 1.0  # where all actors wait for each version, the one that is held is confirmed so often
 _NEXT_RUN_SECONDS = 1.0  # after the end of a run, before the next is looked for
-_FETCH_SHARE = 4.0  # a fetch begins this many times its own duration after the last
+_FETCH_SHARE, _LEAST_PAUSE_SECONDS = 4.0, 0.02  # a fetch begins so many times its own duration after the last
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,44 +53,119 @@ class LinkEvents(Protocol):
         ...
 
 
+class LinkSession(PolicySession):
+    """What the gateway itself says to learners: it follows their policies, and is no actor."""
+
+    def __init__(self, config: ActorConfig, origin: Origin) -> None:
+        super().__init__(config, origin)
+        self._mentioned_version = -1  # of this learner epoch, by an acknowledgement
+        self._fetch_wanted = False
+        self._looks_again = False
+        self._failure: PolicyError | None = None  # of the policy, when it acted
+
+    # ------------------------------------------------------------------------------------------------ events
+
+    def look_again(self) -> None:
+        """Look for the learner: an actor was fenced."""
+        self._looks_again = True
+
+    def fail(self, error: PolicyError) -> None:
+        """Leave the learner: its policy does not run."""
+        self._failure = error
+
+    def want_newest(self) -> None:
+        """Fetch a newer snapshot, although no client has heard of one."""
+        self._fetch_wanted = True
+
+    def mention(self, epoch: int, version: int) -> None:
+        """Note that a learner has a policy version."""
+        if epoch == self.learner_epoch:
+            self._mentioned_version = max(self._mentioned_version, version)
+
+    # ------------------------------------------------------------------------------------------------- steps
+
+    def check(self) -> None:
+        """Raise if there is a reason to leave the learner: see Conversation."""
+        super().check()
+        if self._looks_again:
+            raise LearnerLostError
+        if self._failure is not None:
+            raise self._failure
+
+    def begin(self, session: Welcome) -> Steps[bytes]:
+        """Follow the learner that was found; return its program."""
+        self._looks_again, self._failure, self._mentioned_version = False, None, -1
+        self.act(WatchPresence(keys.learner(session.run)))
+        self.feed.begin()
+        self.feed.subscribe()
+        return (yield from self.await_program(session))
+
+    def first_snapshot(self, session: Welcome) -> Steps[Snapshot]:
+        """Return the first snapshot that comes."""
+        yield from self.await_snapshot(lambda: self.feed.newest is not None)
+        assert self.feed.newest is not None
+        if not session.spec.algorithm.synchronous:  # otherwise all actors wait for each version: it is pushed
+            self.feed.use_fetches()
+        return self.feed.newest
+
+    def next_snapshot(self, session: Welcome, held: int) -> Steps[Snapshot]:
+        """Return a snapshot that is newer than the version that is held. It is fetched once a client has heard of it.
+
+        Large weights are not fetched without pause.
+        """
+        while (newest := self.feed.newest) is None or newest.policy_version <= held:
+            if self._next_fetch_at(held) <= self.now:
+                self._fetch_wanted = False
+                self.feed.fetch()
+            if session.spec.algorithm.synchronous and self.now > self.feed.confirmed_at + _CONFIRM_SECONDS:
+                self.feed.request_confirmation()
+            pause = min(self._next_fetch_at(held) - self.now, _CONFIRM_SECONDS)
+            yield from self.wait(lambda: self._has_newer(held), max(pause, _LEAST_PAUSE_SECONDS), reads=True)
+        return newest
+
+    def _has_newer(self, held: int) -> bool:
+        newest = self.feed.newest
+        return (newest is not None and newest.policy_version > held) or self._next_fetch_at(held) <= self.now
+
+    def _next_fetch_at(self, held: int) -> float:
+        """Return when to fetch; never if there is nothing to fetch, or a fetch is in progress."""
+        if self.feed.is_awaited or not (self._fetch_wanted or self._mentioned_version > held):
+            return float("inf")
+        return self.feed.fetched_at + max(_FETCH_SHARE * self.feed.fetch_seconds, _LEAST_PAUSE_SECONDS)
+
+
 class LearnerLink:
     """The gateway's view of one learner after the other."""
 
-    def __init__(self, transport: Transport, join: Join, run: str, stop: threading.Event, events: LinkEvents) -> None:
+    def __init__(self, session: LinkSession, transport: Transport, stop: threading.Event, events: LinkEvents) -> None:
         """Construct the link.
 
         Args:
+          session: what it says to learners.
           transport: the network; the caller closes it.
-          join: the gateway's own request for a run's specification; it is no actor.
-          run: the run to follow, or keys.ANY_RUN.
           stop: ends `run`.
           events: receives what happens.
         """
-        self._transport, self._join, self._run_to_join, self._stop, self._events = transport, join, run, stop, events
-        self.lock = StateLock()
-        self.presence = LearnerPresence(self.lock)
-        self.queries = LearnerQueries(transport)
-        self.newest_version: Callable[[], int] = lambda: -1  # that an acknowledgement mentioned
-        self._end = RunEndWatch(transport, stop)
-        self._feed = SnapshotFeed(transport, self.queries, self._end, join.actor, self.presence.heard)
-        self._watched: set[str] = set()
-        self._failure: PolicyError | None = None  # of the policy, when it acted
-        self._look_again = False  # an actor was fenced: another learner may have begun
-        self._fetch_wanted = False
+        self._session, self._stop, self._events = session, stop, events
+        self._thread = SessionThread(session, transport, stop)
         self._follows = False  # whether `events` knows of the present learner
         self.newest_policy: NewestPolicy | None = None
 
     def look_again(self) -> None:
-        """Look for the learner: an actor was fenced. From any thread."""
-        self._look_again = True
+        """See LinkSession. From any thread, as the next three."""
+        self._thread.notify(self._session.look_again)
 
     def fail(self, error: PolicyError) -> None:
-        """Leave the learner: its policy does not run. From any thread."""
-        self._failure = error
+        """See LinkSession."""
+        self._thread.notify(self._session.fail, error)
 
     def fetch(self) -> None:
-        """Ask the learner for a newer snapshot, although no client has heard of one. From any thread."""
-        self._fetch_wanted = True
+        """See LinkSession.want_newest."""
+        self._thread.notify(self._session.want_newest)
+
+    def mention(self, epoch: int, version: int) -> None:
+        """See LinkSession."""
+        self._thread.notify(self._session.mention, epoch, version)
 
     def run(self) -> None:
         """Follow learners until `stop` is set.
@@ -106,9 +176,7 @@ class LearnerLink:
         retries = Retries(self._stop)
         while not self._stop.is_set():
             try:
-                session = self.queries.join_learner(self._run_to_join, self._join, None, self._end)
-                self.presence.joined()
-                self._follow(session)
+                self._follow(self._thread.run(self._session.find_learner()))
             except LearnerLostError as error:
                 _logger.info("%s", error)
             except RunOverError as error:
@@ -118,7 +186,7 @@ class LearnerLink:
                 retries.succeeded()
                 self._stop.wait(_NEXT_RUN_SECONDS)
             except (ActorError, PolicyError, TransportError) as error:
-                self.queries.report_failure(self._end.run, self._join, error)
+                self._thread.run(self._session.report_failure(error), to_the_end=True)
                 if self._follows:
                     self._events.on_failure(str(error))
                 retries.wait(str(error))
@@ -127,77 +195,17 @@ class LearnerLink:
 
     def _follow(self, session: Welcome) -> None:
         """Serve one session until something raises."""
-        self._look_again, self._failure = False, None
-        self._end.follow(session.run, session.learner_epoch)
-        if session.run not in self._watched:
-            self._watched.add(session.run)
-            self._transport.watch_presence(keys.learner(session.run), self.presence.on_presence)
         _logger.info("follows run %r", session.run)
-        self._feed.begin(session)
-        self._feed.subscribe()
         self._events.on_learner(session)
         self._follows = True
-        program = self._await_program(session.run)
+        program = self._thread.run(self._session.begin(session))
         policy = OnnxRuntime(program, self._stop)
-        self._await_snapshot()
-        synchronous = session.spec.algorithm.synchronous
-        if not synchronous:  # otherwise all actors wait for each version: it is pushed
-            self._feed.use_fetches()
-        loaded = -1
+        snapshot = self._thread.run(self._session.first_snapshot(session))
         while True:
-            newest = self._feed.newest
-            if newest is not None and newest.policy_version > loaded:
-                runtime = policy.fork()
-                runtime.load(newest.weights)
-                loaded = newest.policy_version
-                self.newest_policy = NewestPolicy(session=session, program=program, snapshot=newest)
-                size = sum(array.nbytes for array in newest.weights.values())
-                self._events.on_policy(
-                    PolicyVersion(session=session, version=loaded, runtime=runtime, size=max(size, 1))
-                )
-            self._wait(_TICK_SECONDS)
-            due = self._fetch_wanted or self.newest_version() > loaded
-            if due and time.monotonic() > self._feed.fetched_at + self._pause():
-                self._fetch_wanted = False
-                self._feed.fetch()
-            if synchronous and time.monotonic() > self._feed.confirmed_at + _MISSED_PUSH_SECONDS:
-                self._feed.request_confirmation()
-            self._feed.read()
-
-    def _pause(self) -> float:
-        """Return how long after a fetch the next may begin: large weights are not fetched without pause."""
-        return _FETCH_SHARE * self._feed.fetch_seconds
-
-    def _await_program(self, run: str) -> bytes:
-        pause = _FIRST_PUSH_SECONDS
-        while (program := self.queries.program(run)) is None:
-            since = self.presence.heard_at  # nothing is pushed yet: the first snapshot says that there is a program
-            deadline = time.monotonic() + pause
-            while self.presence.heard_at == since and time.monotonic() < deadline:
-                self._wait(_TICK_SECONDS)
-            self._feed.read()
-            pause = min(2 * pause, _MISSED_PUSH_SECONDS)
-        return program[1]
-
-    def _await_snapshot(self) -> None:
-        while self._feed.newest is None:
-            self._feed.request_newest()
-            if self._feed.newest is None:
-                self._wait(_FIRST_PUSH_SECONDS)
-                self._feed.read()
-
-    def _wait(self, seconds: float) -> None:
-        """Wait; raise LearnerLostError or RunOverError if there is a reason."""
-        self._stop.wait(seconds)
-        left = self.presence.left  # read before the run's end: a learner that finished says so before it leaves
-        self._end.check()
-        if self._end.learner_stopped:
-            raise LearnerLostError("the learner was stopped; waiting for it to return")
-        if left or self._look_again:
-            raise LearnerLostError
-        if self._failure is not None:
-            raise self._failure
-        if time.monotonic() > self.presence.heard_at + _SILENCE_SECONDS:
-            if not self.queries.learner_responds(self._end.run, self._join):
-                raise LearnerLostError
-            self.presence.heard()
+            runtime = policy.fork()
+            runtime.load(snapshot.weights)
+            self.newest_policy = NewestPolicy(session=session, program=program, snapshot=snapshot)
+            size = max(sum(array.nbytes for array in snapshot.weights.values()), 1)
+            version = snapshot.policy_version
+            self._events.on_policy(PolicyVersion(session=session, version=version, runtime=runtime, size=size))
+            snapshot = self._thread.run(self._session.next_snapshot(session, version))

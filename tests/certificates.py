@@ -4,8 +4,8 @@ import datetime
 import shutil
 from pathlib import Path
 
-from daedalus.cli.certificate_authority import CertificateAuthority
 from daedalus.cli.commands.certs import certs
+from daedalus.launch.certificates import CertificateAuthority
 from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import Credentials
 

@@ -7,17 +7,19 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from plain import ACTION, NAME, vector_spaces
 
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.run_end import RunEndWatch
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.conversation import Conversation
+from daedalus.actor.session.session_thread import SessionThread
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, Snapshot, Welcome
+from daedalus.protocol.messages import Acknowledgement, Snapshot, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.zenoh_transport import connect
 
@@ -160,16 +162,16 @@ class Sender:
     def __init__(self, address: str, name: str, environments: int = 2) -> None:
         self.transport = connect([address])
         self.name, self.environments, self.incarnation = name, environments, secrets.randbits(62)
-        self._queries = LearnerQueries(self.transport)
-        join = Join(actor=name, incarnation=self.incarnation, spaces=CARTPOLE, environments=environments)
-        end = RunEndWatch(self.transport, threading.Event())
-        self.welcome: Welcome = self._queries.join_learner(keys.ANY_RUN, join, ANSWER_SECONDS, end)
-        self.transport.declare_presence(keys.presence(self.welcome.run, name, self.incarnation))
+        self._talk = Conversation(ActorConfig(name=name, incarnation=self.incarnation, timeout=ANSWER_SECONDS))
+        self._thread = SessionThread(self._talk, self.transport, threading.Event())
+        found = self._thread.run(self._talk.find_learner())
+        join = replace(self._talk.join, spaces=CARTPOLE, environments=environments)
+        self.welcome: Welcome = self._thread.run(self._talk.confirm(found, join))
         self.key = keys.rollouts(self.welcome.run, name)
 
     def version(self) -> int:
         """Return the newest policy version, or 0 before the first."""
-        messages = self._queries.newest_snapshot(self.welcome.run)
+        messages = self._thread.run(self._talk.ask(keys.snapshots(self.welcome.run)))
         newest = [message for message in messages if isinstance(message, Snapshot)]
         return newest[0].policy_version if newest else 0
 

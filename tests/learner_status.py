@@ -1,8 +1,8 @@
 """Status of a running learner, asked by the process of the test: `daedalus status` takes a second to start."""
 
-from daedalus.cli.status_query import ask
 from daedalus.protocol.codec import ProtocolError
 from daedalus.transport.interface import TransportError
+from daedalus.transport.status_query import ask
 from daedalus.transport.zenoh_transport import connect
 
 

@@ -11,7 +11,7 @@ from plain import vector_spaces
 from processes import LIMIT
 
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.config import ActorConfig
+from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic

@@ -9,8 +9,8 @@ from typing import Any
 from processes import LIMIT
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run.resuming import Beginning
 from daedalus.learner.service import LearnerService, Outcome, Outputs

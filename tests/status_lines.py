@@ -6,9 +6,9 @@ Each line is one JSON object, or empty if no learner answers. The program runs u
 import sys
 import threading
 
-from daedalus.cli.status_query import ask
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import TransportError
+from daedalus.transport.status_query import ask
 
 if __name__ == "__main__":
     never = threading.Event()

@@ -12,7 +12,7 @@ from daedalus.learner.run.settings import preset_names
 
 ROOT = Path(__file__).parent.parent
 FILES = ("LICENSE", "MANIFEST.in", "README.md", "pyproject.toml")
-SCRIPTS = ("actor", "cli", "gateway", "learner", "policy", "protocol", "transport")
+SCRIPTS = ("actor", "cli", "gateway", "launch", "learner", "policy", "protocol", "transport")
 RAISES = "raise ImportError('this is not the package that Daedalus means')\n"
 
 

@@ -116,7 +116,7 @@ class ClientCollector:
         self.policy_loaded.set()
 
     def has_rollout(self) -> bool:
-        """See Collector."""
+        """Return whether `collect` would return a rollout now. Safe from any thread."""
         return self._exchange.has_rollout()
 
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout | None:

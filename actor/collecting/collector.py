@@ -35,10 +35,6 @@ class Collector(Protocol):
         """Note that the loaded snapshot was the learner's newest at a monotonic time, in seconds."""
         ...
 
-    def has_rollout(self) -> bool:
-        """Return whether `collect` would return a rollout now. Safe from any thread."""
-        ...
-
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None]) -> Rollout | None:
         """Return the next rollout, or None if it depends on somebody else and is not complete yet.
 

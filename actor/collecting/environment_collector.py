@@ -74,10 +74,6 @@ class EnvironmentCollector:
     def confirm(self, at: float) -> None:
         """See Collector. Has no effect: the policy acts whatever its age."""
 
-    def has_rollout(self) -> bool:
-        """See Collector. `collect` never waits for anybody here."""
-        return True
-
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout:
         """See Collector. Step the environments until the rollout is full."""
         writer, environments = self._writer, self._environments

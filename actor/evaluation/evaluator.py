@@ -8,25 +8,66 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.origin import own_origin
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
+from daedalus.actor.session.actor_config import ActorConfig, own_origin
+from daedalus.actor.session.conversation import Conversation, Query, RunOverError, Steps, Wait, Work
+from daedalus.actor.session.session_thread import SessionThread
 from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.protocol.messages import EvaluationReport, Join, Snapshot, Welcome
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Message,
+    Refusal,
+    Snapshot,
+    Welcome,
+)
 from daedalus.protocol.texts import short_number
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
 
 _DEFAULT_SECONDS = 60.0  # between evaluations, unless the run says otherwise
-_POLL_SECONDS = 0.2  # how soon a wait notices the end of the run
+_UPDATE_SECONDS = 60.0  # for a query that is answered between two updates, which may be slow
+
+
+class EvaluatorSession(Conversation):
+    """All that an evaluator says to learners."""
+
+    def request_snapshot(self) -> Steps[Snapshot | None]:
+        """Return the newest snapshot, or None if the learner has none to evaluate.
+
+        The learner keeps a checkpoint of the same version until `report`. Raises RunOverError if the run is over.
+        """
+        answer = yield from self._ask_between_updates(encode(EvaluationRequest(evaluator=self.config.name)))
+        if isinstance(answer, Refusal) and answer.code == "finished":
+            raise RunOverError("the run is over", finished=True)
+        return answer if isinstance(answer, Snapshot) else None
+
+    def report(self, report: EvaluationReport) -> Steps[None]:
+        """Report a policy's returns to the learner; a rejected report is lost. Raises as `request_snapshot`."""
+        answer = yield from self._ask_between_updates(encode(report))
+        if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
+            _logger.warning("the learner rejected the evaluation: %s", answer.reason)
+
+    def _ask_between_updates(self, payload: bytes) -> Steps[Message | None]:
+        """Send a query that the learner answers between two updates; return None without an answer."""
+        answers = list[bytes | None]()
+        key = keys.evaluations(self.run, self.config.name)
+        self.act(Query(key, payload, _UPDATE_SECONDS, lambda answer, _: answers.append(answer)))
+        while not answers:
+            yield Wait(None)
+            self.check_over()
+        data = answers[0]
+        return None if data is None else (yield Work(partial(self.decode, data)))
 
 
 class Evaluator:
@@ -41,9 +82,8 @@ class Evaluator:
     ) -> None:
         """`stop` ends `run`, also in the middle of an episode; for `on_join`, see ActorService."""
         self._config, self._stop, self._on_join = config, stop, on_join
-        self._end = RunEndWatch(transport, stop)
-        self._queries = LearnerQueries(transport)
-        self._join = Join(actor=config.name, incarnation=config.incarnation, origin=own_origin(transport))
+        self._session = EvaluatorSession(config, own_origin(transport))
+        self._thread = SessionThread(self._session, transport, stop)
         self._warned_of_cuts = False
 
     def run(self) -> bool:
@@ -54,18 +94,16 @@ class Evaluator:
         """
         try:
             while True:
-                run = self._config.run_to_join(self._end.run)
-                self._evaluate_learner(self._queries.join_learner(run, self._join, self._config.timeout, self._end))
+                self._evaluate_learner(self._thread.run(self._session.find_learner()))
         except RunOverError as error:
             _logger.info("%s", error)
             return error.finished
         except Exception as error:
-            self._queries.report_failure(self._end.run, self._join, error)
+            self._thread.run(self._session.report_failure(error), to_the_end=True)
             raise
 
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
-        self._end.follow(welcome.run, welcome.learner_epoch)
         self._on_join(welcome)
         spec = welcome.spec
         interval = spec.evaluation.seconds or _DEFAULT_SECONDS
@@ -80,8 +118,7 @@ class Evaluator:
         try:
             due = time.monotonic() + interval
             for number in itertools.count():
-                while (now := time.monotonic()) < due:
-                    self._end.wait(min(due - now, _POLL_SECONDS))
+                self._thread.run(self._session.pause(due - time.monotonic()))
                 due = time.monotonic() + interval
                 # An actor's seed is made of other numbers: no episode of training is evaluated here.
                 seed = int(np.random.SeedSequence([welcome.seed, spec.seed, number]).generate_state(1)[0])
@@ -92,13 +129,13 @@ class Evaluator:
 
     def _evaluate(self, welcome: Welcome, environments: VectorEnvironment, seed: int) -> bool:
         """Request a policy, evaluate it and report; return False if the learner is gone."""
-        snapshot = self._queries.evaluation_snapshot(welcome.run, self._config.name, self._end)
+        snapshot = self._thread.run(self._session.request_snapshot())
         if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
             return False
-        program = self._queries.program(welcome.run, snapshot.program)
+        program = self._thread.run(self._session.program(snapshot.program))
         if program is None:
             return False
-        runtime = OnnxRuntime(program[1], self._stop)
+        runtime = OnnxRuntime(program, self._stop)
         runtime.load(snapshot.weights)
         wanted = welcome.spec.evaluation
         sampled = wanted.actions == "sampled"
@@ -116,20 +153,17 @@ class Evaluator:
             self._warned_of_cuts = True
             cut, longest = int(evaluation.cut.sum()), wanted.max_episode_env_steps
             _logger.warning("%s", cut_note(cut, wanted.episodes, longest, sampled=sampled))
-        self._queries.report_evaluation(
-            welcome.run,
-            EvaluationReport(
-                evaluator=self._config.name,
-                learner_epoch=snapshot.learner_epoch,
-                policy_version=snapshot.policy_version,
-                returns=evaluation.returns,
-                lengths=evaluation.lengths,
-            ),
-            self._end,
+        report = EvaluationReport(
+            evaluator=self._config.name,
+            learner_epoch=snapshot.learner_epoch,
+            policy_version=snapshot.policy_version,
+            returns=evaluation.returns,
+            lengths=evaluation.lengths,
         )
+        self._thread.run(self._session.report(report))
         return True
 
     def _raise_if_ended(self, _finished: int, _mean: float) -> bool:
         """End an evaluation with the run or on `stop`, in the middle of an episode: called after every step."""
-        self._end.check()
+        self._thread.call(self._session.check_over)
         return False

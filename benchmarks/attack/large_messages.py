@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.attack.verdict import Verdict
 from benchmarks.chaos.scene import ENDLESS, resident_mib, scene
-from daedalus.cli.certificate_folder import CertificateFolder, Identity
+from daedalus.launch.certificates import CertificateFolder, Identity
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits

@@ -15,7 +15,7 @@ from contextlib import closing
 
 from benchmarks.attack.verdict import Verdict
 from benchmarks.chaos.scene import ENDLESS, scene
-from daedalus.cli.certificate_folder import CertificateFolder, Identity
+from daedalus.launch.certificates import CertificateFolder, Identity
 from daedalus.protocol import keys
 from daedalus.transport.credentials import Credentials, load
 from daedalus.transport.interface import RefusedError, Transport, TransportError

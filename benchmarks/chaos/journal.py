@@ -6,10 +6,10 @@ import sys
 from collections.abc import Callable
 from typing import Any, cast
 
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
-from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import stop_on_signals
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
+from daedalus.launch.logs import configure_logging
+from daedalus.launch.process_lifecycle import stop_on_signals
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement

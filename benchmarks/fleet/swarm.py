@@ -17,13 +17,14 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 
-from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
-from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.run_end import RunEndWatch
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.conversation import Conversation
+from daedalus.actor.session.session_thread import SessionThread
+from daedalus.actor.session.uploading import InFlightRollouts
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, Snapshot
+from daedalus.protocol.messages import Acknowledgement, Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.connecting import connect_with_retry
@@ -65,7 +66,6 @@ class Simulated:
         transport = connect_with_retry([address], threading.Event(), _WAIT_SECONDS)
         assert transport is not None  # the event is never set
         self._transport = transport
-        self._queries = LearnerQueries(self._transport)
         self._changed = threading.Condition()
         self._in_flight = InFlightRollouts(window=1)
         self._sequence, self._version = 0, -1
@@ -73,12 +73,13 @@ class Simulated:
         self.latencies: list[float] = []
         self.came: list[tuple[int, float]] = []  # policy version and time of each snapshot received
         incarnation = secrets.randbits(62)
-        join = Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS)
-        end = RunEndWatch(transport, threading.Event())
-        self._welcome = self._queries.join_learner(keys.ANY_RUN, join, _WAIT_SECONDS, end)
+        self._talk = Conversation(ActorConfig(name=name, incarnation=incarnation, timeout=_WAIT_SECONDS))
+        self._session = SessionThread(self._talk, transport, threading.Event())
+        found = self._session.run(self._talk.find_learner())
+        join = replace(self._talk.join, spaces=SPACES, environments=ENVIRONMENTS)
+        self._welcome = self._session.run(self._talk.confirm(found, join))
         run = self._welcome.run
         self._inbox = self._transport.subscribe(keys.snapshots(run), self._on_news)
-        self._transport.declare_presence(keys.presence(run, name, incarnation))
         self._key = keys.rollouts(run, name)
         self._rollout = replace(
             recorded(self._welcome.spec.collection.rollout_length),
@@ -94,7 +95,7 @@ class Simulated:
 
     def has_policy(self) -> bool:
         """Query the newest snapshot and return whether there is one."""
-        for message in self._queries.newest_snapshot(self._welcome.run):
+        for message in self._session.run(self._talk.ask(keys.snapshots(self._welcome.run))):
             if isinstance(message, Snapshot):
                 self._version = max(self._version, message.policy_version)
         return self._version >= 0

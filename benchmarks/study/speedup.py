@@ -38,9 +38,8 @@ from benchmarks.running import COMMAND, machine, table
 from benchmarks.study.simulated_actors import train_simulated
 from daedalus.actor.environments.make import make_environments
 from daedalus.analysis.comparison import estimate, written
-from daedalus.cli.settings_arguments import Choice
+from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
-from daedalus.learner.run.settings import override
 from daedalus.protocol.spec import EnvironmentSpec
 
 _IDENTITY = ("task", "method", "actors", "seed", "milliseconds")
@@ -100,16 +99,15 @@ def simulate(run: Mapping[str, Any]) -> dict[str, Any]:
     task, (algorithm, _) = TASKS[run["task"]], METHODS[run["method"]]
     environments = make_environments(EnvironmentSpec(id=task.id), 1)
     environments.close()
-    choice = Choice(
-        preset=None,
+    choice = RunChoice(
         env=task.id,
         algorithm=algorithm,
         seed=run["seed"],
         env_steps=task.env_steps,
         actors=run["actors"],
-        wrap=None,
+        assignments=changes(run),
     )
-    spec = choice.spec(lambda settings: override(settings, changes(run)), default_settings(environments.spaces))
+    spec = choice.spec(default_settings(environments.spaces))
     learner, seconds = train_simulated(spec, run["milliseconds"] / 1000)
     if learner.env_steps_to_target is None:
         return {"seconds": "", "env_steps": ""}

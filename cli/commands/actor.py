@@ -1,125 +1,137 @@
-"""`daedalus actor`: construct one actor and run it.
-
-Exit status: 0 the run is over, the actor was stopped or an operator drained it; 1 failed; 2 bad usage. With --stay,
-an actor ends by a signal, a drain, wrong arguments, or after the --timeout that its user set; all other failures have
-causes that somebody else can remove, so it reports them and tries again.
-"""
+"""`daedalus actor`: play environments for a learner."""
 
 import argparse
-import logging
-import secrets
 import sys
-import threading
-from collections.abc import Callable
-from dataclasses import replace
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.errors import ActorError, NoLearnerError
-from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
-from daedalus.cli.commands import actor_arguments as options
-from daedalus.cli.logs import configure_logging, print_error
-from daedalus.cli.processes import (
-    FAILED,
+from daedalus.cli.arguments import (
+    add_allow_module,
+    add_connect,
+    add_logging,
+    add_tls,
+    command_parser,
+    log_options,
+    seconds,
+)
+from daedalus.launch.actor_process import ActorOptions, run_actor
+from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
     exit_with_parent,
-    status_at_start,
     stop_on_signals,
 )
-from daedalus.policy.acting.runtime import PolicyError
-from daedalus.policy.user_code import frames_of, is_of_user
-from daedalus.protocol.messages import Welcome
-from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect
-from daedalus.transport.interface import TransportError, UnreachableError
-from daedalus.transport.retries import Retries
+from daedalus.protocol import keys
 
-_logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
+DESCRIPTION = """\
+Plays environments and sends rollouts to a learner. An actor needs one address: the environment, the network and all
+settings come from the learner. An actor may start before the learner, and may join or leave at any time."""
 
-_REPORTED = (ActorError, EnvironmentSetupError, PolicyError, TransportError)  # each in one line
-_NEXT_RUN_SECONDS = 2.0  # after a run, before the next is looked for: its learner may answer for some seconds more
+EXAMPLES = """\
+examples:
+  daedalus actor --connect tcp/127.0.0.1:7447
+  daedalus actor --connect tcp/gpu-box:7447 --envs 32 --name arm-3
+  daedalus actor --connect tls/gpu-box:7447 --tls actor-arm-3
+  daedalus actor --connect tcp/gpu-box:7447 --allow-module corridor      (the run plays corridor:Corridor-v0)
+  daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
+  daedalus actor --connect tcp/router:7447 --stay      (serves one run after another)
+
+exit status: 0 the run is over, the actor was stopped or an operator drained it; 1 failed; 2 bad usage. With --stay an
+actor ends by a signal, a drain, wrong arguments or its --timeout; after any other failure it tries again"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus actor`."""
+    options = command_parser("actor", DESCRIPTION, EXAMPLES)
+    add_connect(options, "address of the learner or of its router. May be given several times")
+    options.add_argument(
+        "--envs",
+        type=int,
+        metavar="E",
+        help="number of environments to step together (default: as the learner asks)",
+    )
+    add_allow_module(options, "the learner")
+    options.add_argument(
+        "--runtime",
+        choices=("onnx", "torch"),
+        default="onnx",
+        help="library that runs the policy (default: %(default)s, which needs no torch)",
+    )
+    _add_connection(options)
+    options.add_argument(
+        "--evaluator",
+        action="store_true",
+        help="play the evaluations of the run on its schedule and report the returns, instead of sending rollouts",
+    )
+    options.add_argument(
+        "--stay",
+        action="store_true",
+        help="wait for the next run when a run is over, and try again after a failure that others may remove, such as "
+        "a module that a run needs, instead of ending. `daedalus drain` or a signal ends the actor",
+    )
+    add_tls(options)
+    add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
+    return options
+
+
+def _add_connection(options: argparse.ArgumentParser) -> None:
+    """Add the options about the learner, the name and the link."""
+    runs = options.add_mutually_exclusive_group()
+    runs.add_argument(
+        "--run",
+        default=keys.ANY_RUN,
+        metavar="NAME",
+        help="run to join, if several runs share a network (default: the only run; the actor then stays with this run)",
+    )
+    runs.add_argument(
+        "--any-run", action="store_true", help="change to another run when the learner of the present one has gone"
+    )
+    options.add_argument(
+        "--name",
+        metavar="NAME",
+        help="name of this actor. Keep it after a restart (default: made from the name of the host)",
+    )
+    options.add_argument(
+        "--link",
+        choices=("auto", "lan", "wan"),
+        default="auto",
+        help="lan: fetch whole snapshots. wan: fetch snapshots as bfloat16 differences, as often as the link "
+        "allows (default: %(default)s, which measures the link)",
+    )
+    options.add_argument(
+        "--timeout",
+        type=seconds,
+        metavar="SECONDS",
+        help="time to look for a learner before giving up (default: no limit)",
+    )
+
+
+def actor_options(arguments: argparse.Namespace) -> ActorOptions:
+    """Return what the command line asks for."""
+    return ActorOptions(
+        connect=arguments.connect,
+        tls=arguments.tls,
+        evaluator=arguments.evaluator,
+        stay=arguments.stay,
+        name=arguments.name,
+        run=arguments.run,
+        any_run=arguments.any_run,
+        environments=arguments.envs,
+        runtime=arguments.runtime,
+        link=arguments.link,
+        timeout=arguments.timeout,
+        allowed_modules=frozenset(arguments.allow_module),
+    )
 
 
 def main() -> int:
     """Run `daedalus actor` and return its exit status."""
-    arguments = options.parser().parse_args()
+    arguments = parser().parse_args()
     context: dict[str, str] = {}
-    configure_logging(arguments.log_level, as_json=arguments.log_json, process="actor", context=context)
+    log_options(arguments).configure(process="actor", context=context)
     stop = stop_on_signals(exit_if_stuck=True)
     if arguments.exit_with_parent:
         exit_with_parent(stop)
-    retries = Retries(stop)
-    while True:
-        try:
-            credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
-            config = options.config(arguments, credentials)
-            break
-        except (ValueError, *SECURITY_ERRORS) as error:
-            if not (arguments.stay and isinstance(error, NotValidNowError)):
-                print_error("actor", error)
-                return status_at_start(error)
-            if retries.wait(str(error)):
-                return 0
-    context["actor"] = config.name
-
-    def note(welcome: Welcome) -> None:
-        context.update(run=welcome.run, epoch=f"{welcome.learner_epoch:x}")
-
-    while True:
-        try:
-            finished = _serve_run(arguments, config, credentials, stop, note)
-        except Exception as error:  # broad: see _is_of_others
-            if not arguments.stay or not _is_of_others(error):
-                if not isinstance(error, _REPORTED):
-                    raise
-                print_error("actor", error)
-                return FAILED
-            if not isinstance(error, _REPORTED):
-                _logger.exception("a module of the run has failed")
-            stopped = retries.wait(str(error) or type(error).__name__)
-        else:
-            if not (finished and arguments.stay):
-                return 0
-            retries.succeeded()
-            _logger.info("waiting for the next run")
-            stopped = stop.wait(_NEXT_RUN_SECONDS)
-        if stopped:
-            return 0
-        config = replace(config, incarnation=secrets.randbits(62))
-
-
-def _is_of_others(error: Exception) -> bool:
-    """Return whether somebody else can remove the cause of an error, such as who started a run or renews certificates.
-
-    Not the end of the time that the user of this actor set, and no fault of ours. A module of the run may raise
-    anything.
-    """
-    if isinstance(error, (NoLearnerError, UnreachableError)):
-        return False
-    of_users = (frame for frame in frames_of(error) if is_of_user(frame))
-    return isinstance(error, _REPORTED) or any(
-        frame.tb_frame.f_globals.get("__name__") != "__main__" for frame in of_users
-    )
-
-
-def _serve_run(
-    arguments: argparse.Namespace,
-    config: ActorConfig,
-    credentials: Credentials | None,
-    stop: threading.Event,
-    on_join: Callable[[Welcome], None],
-) -> bool:
-    """Take part in one run; return whether the run finished. Raises what `main` reports."""
-    transport = connect_with_retry(arguments.connect, stop, config.timeout, credentials)
-    if transport is None:
-        return False
-    try:
-        role = Evaluator if arguments.evaluator else ActorService
-        return role(config, transport, stop, on_join=on_join).run()
-    finally:
-        transport.close()
+    return run_actor(actor_options(arguments), stop, context)
 
 
 if __name__ == "__main__":

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.client_tokens import ClientTokens
-from daedalus.cli.logs import print_error, say
+from daedalus.launch.certificates import ClientTokens
+from daedalus.launch.logs import print_error, say
 from daedalus.transport.credentials import CLIENTS, WARNING_DAYS, CredentialsError
 
 if TYPE_CHECKING:
-    from daedalus.cli.certificate_folder import CertificateFolder, Identity
+    from daedalus.launch.certificates import CertificateFolder, Identity
 
 _DAYS = 825
 _LISTENERS, _NAMED = ("learner", "router", "gateway"), ("actor", "operator", "client")
@@ -103,7 +103,7 @@ def certs(arguments: list[str]) -> int:
     """Run `daedalus certs` and return its exit status."""
     parsed = parser().parse_args(arguments)
     try:
-        from daedalus.cli.certificate_folder import CertificateFolder
+        from daedalus.launch.certificates import CertificateFolder
 
         if parsed.verb == "init":
             lines = _init(parsed)
@@ -121,7 +121,7 @@ def certs(arguments: list[str]) -> int:
 
 
 def _init(parsed: argparse.Namespace) -> list[str]:
-    from daedalus.cli.certificate_folder import CertificateFolder, Identity
+    from daedalus.launch.certificates import CertificateFolder, Identity
 
     directory = parsed.directory
     folder = CertificateFolder.create(directory, parsed.host, _lifetime(parsed))
@@ -222,7 +222,7 @@ def _state(days: float) -> str:
 
 
 def _named(parsed: argparse.Namespace) -> "list[Identity]":
-    from daedalus.cli.certificate_folder import Identity
+    from daedalus.launch.certificates import Identity
 
     if (parsed.role in _NAMED) != bool(parsed.names):
         raise CredentialsError("wrong number of names: name actors, operators and clients, and nobody else")

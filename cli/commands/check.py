@@ -11,10 +11,10 @@ import numpy as np
 
 from daedalus.actor.checking.check_report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
-from daedalus.cli.logs import print_error, say
-from daedalus.cli.quick_check import with_preset
-from daedalus.cli.settings_arguments import add_settings, resolve_spec
+from daedalus.cli.settings_arguments import add_settings, run_choice
+from daedalus.launch.environment_check import CheckTimeoutError, EnvironmentCheck, check_in_process, with_preset
+from daedalus.launch.logs import print_error, say
+from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of
@@ -59,34 +59,35 @@ def check(arguments: list[str]) -> int:
     """Run `daedalus check` and return its exit status."""
     parsed = parser().parse_args(arguments)
     try:
-        spec = resolve_spec(parsed)
+        choice = run_choice(parsed)
+        spec = choice.spec()
     except SettingsError as error:
         print_error("check", error)
         return 2
     if not parsed.seconds > 0.0:
         print_error("check", f"--seconds is {parsed.seconds:g}: choose a number above 0")
         return 2
-    lines = _checked(spec, parsed)
+    lines = _checked(choice, spec, parsed.seconds)
     say("\n".join(f"{name:<14}{text}" for name, text in lines))
     return 1 if any(name == "problem" for name, _ in lines) else 0
 
 
-def _checked(spec: RunSpec, parsed: argparse.Namespace) -> list[tuple[str, str]]:
+def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str, str]]:
     """Return the lines of the report, each with its name."""
     environment, modules = spec.environment, UserModules(frozenset(modules_of(spec.user_modules)))
     check = EnvironmentCheck(
         spec=environment,
         modules=modules,
-        seconds=parsed.seconds,
+        seconds=seconds,
         env_steps=_ENV_STEPS,
         seed=spec.training.seed,
-        most_seconds=parsed.seconds + _MORE_SECONDS,
+        most_seconds=seconds + _MORE_SECONDS,
         shown=True,
         notes=True,
     )
     chosen = report = _report(check)
-    if parsed.env is not None:
-        spec = resolve_spec(parsed, default_settings(report.spaces, [*environment.leave_out, *report.constant_texts]))
+    if choice.env is not None:
+        spec = choice.spec(default_settings(report.spaces, [*environment.leave_out, *report.constant_texts]))
         if spec.environment != environment and report.spaces is not None:
             chosen = _report(replace(check, spec=spec.environment, seconds=0.0, notes=False))
     network, fault = _network(spec, chosen.spaces, modules)

@@ -8,7 +8,7 @@ from daedalus.analysis.comparison import as_csv, as_text, compare_groups
 from daedalus.analysis.recorded_run import SECONDS
 from daedalus.analysis.run_groups import select
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.logs import print_error, say
+from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\

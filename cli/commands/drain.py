@@ -4,9 +4,8 @@ import argparse
 import time
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser, seconds
-from daedalus.cli.logs import print_error, say
-from daedalus.cli.processes import status_at_start
-from daedalus.cli.status_query import ask, decoded, newest_of_each_run, no_answer
+from daedalus.launch.logs import print_error, say
+from daedalus.launch.process_lifecycle import status_at_start
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
@@ -15,6 +14,7 @@ from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.status_query import ask, decoded, newest_of_each_run, no_answer
 
 LEFT, FAILED = 0, 1
 

@@ -8,32 +8,27 @@ import threading
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, get_args
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
-from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.episodes import Evaluation, cut_note, environments_for, play_episodes
-from daedalus.actor.evaluation.video import Video, VideoError
-from daedalus.cli.arguments import allowing
-from daedalus.cli.commands.evaluate_arguments import check, parser
-from daedalus.cli.evaluation_progress import EvaluationProgress, EvaluationStoppedError
-from daedalus.cli.logs import configure_logging, print_error, say
-from daedalus.cli.processes import (
+from daedalus.actor.evaluation.video import VideoError
+from daedalus.cli.arguments import add_allow_module, add_logging, allowing, command_parser
+from daedalus.launch.evaluation import EPISODES, EvaluationOptions, EvaluationStoppedError, run_evaluation
+from daedalus.launch.logs import configure_logging, print_error, say
+from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
     exit_with_parent,
     open_standard_streams,
     stop_on_signals,
 )
-from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
-from daedalus.policy.saving.best_checkpoints import is_best, is_best_in_training
-from daedalus.policy.saving.hub import HubError, RepositoryNameError, pull
-from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
+from daedalus.policy.acting.program_check import PolicyError
+from daedalus.policy.saving.best_checkpoints import is_best_in_training
+from daedalus.policy.saving.hub import HubError, RepositoryNameError
+from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.policy.user_modules import ModuleNotAllowedError
+from daedalus.protocol.spec import Backend
 from daedalus.protocol.texts import short_number
 
 _FAILURES = (
@@ -45,6 +40,106 @@ _FAILURES = (
     PolicyError,
     VideoError,
 )
+
+
+DESCRIPTION = """\
+Plays new episodes with the policy of a run and reports their returns, with unscaled rewards. By default it uses the
+best checkpoint of the run: by the evaluations during training, or by its training episodes where there were none. If
+there is no best one, it uses the newest. Name the folder of a checkpoint to use that one."""
+
+EXAMPLES = """\
+examples:
+  daedalus evaluate runs/cartpole-impala-s1-20261121-101500
+  daedalus evaluate RUN_DIR --episodes 1000 --record
+  daedalus evaluate RUN_DIR --seed 7 --actions sampled
+  daedalus evaluate RUN_DIR/checkpoints/0000000143
+  daedalus evaluate RUN_DIR --backend gymnasium --episodes 100
+  daedalus evaluate RUN_DIR --video drive.gif --max-seconds 20
+  daedalus evaluate RUN_DIR --render
+  daedalus evaluate --from-hub USER/NAME --revision main
+  daedalus evaluate RUN_DIR --allow-module corridor      (the run plays corridor:Corridor-v0)
+
+exit status: 0 done, 1 failed or stopped, 2 bad usage"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus evaluate`."""
+    options = command_parser("evaluate", DESCRIPTION, EXAMPLES)
+    options.add_argument(
+        "directory", type=Path, nargs="?", metavar="RUN_DIR", help="a run directory, or one of its checkpoints"
+    )
+    options.add_argument(
+        "--pretrained",
+        metavar="NAME",
+        help="a policy that is part of the package, instead of a run: car_racing or car_racing_continuous",
+    )
+    options.add_argument(
+        "--from-hub", metavar="USER/NAME", help="a policy on the Hugging Face Hub (daedalus push), instead of a run"
+    )
+    options.add_argument(
+        "--revision", metavar="REVISION", help="branch, tag or commit of --from-hub (default: the newest of main)"
+    )
+    options.add_argument("--newest", action="store_true", help="use the newest checkpoint of the run, not the best")
+    options.add_argument(
+        "--episodes",
+        type=int,
+        metavar="N",
+        help=f"number of episodes (default: {EPISODES}, or 1 with --video or --render)",
+    )
+    options.add_argument(
+        "--seed", type=int, metavar="S", help="seed of the environments (default: a seed that training did not use)"
+    )
+    options.add_argument(
+        "--actions",
+        choices=("greedy", "sampled"),
+        help="greedy: the most probable actions. sampled: as in training (default: evaluation.actions of the run)",
+    )
+    options.add_argument(
+        "--backend",
+        choices=get_args(Backend),
+        help="implementation of the environment (default: evaluation.final_backend of the run, or the backend of "
+        "the training)",
+    )
+    options.add_argument(
+        "--envs",
+        type=int,
+        metavar="E",
+        help="number of environments to step together (default: as many as training had, at most one for each episode)",
+    )
+    options.add_argument(
+        "--wrap",
+        metavar="MODULE:FUNCTION",
+        help="your function that takes each gymnasium environment and returns the one to play, or none (default: "
+        "environment.wrap of the run)",
+    )
+    add_allow_module(options, "the run")
+    options.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    options.add_argument(
+        "--record",
+        action="store_true",
+        help="keep the result in the run directory, as the evaluation that report, compare and push show "
+        "(evaluation.json)",
+    )
+    _add_watching(options)
+    add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
+    return options
+
+
+def _add_watching(options: argparse.ArgumentParser) -> None:
+    """Add the options for videos and windows."""
+    watching = options.add_argument_group("watching", "with one environment, on gymnasium's implementation")
+    watching.add_argument("--video", type=Path, metavar="FILE", help="record the episodes as FILE.mp4 or FILE.gif")
+    watching.add_argument(
+        "--width",
+        type=int,
+        metavar="W",
+        help="width of the video in pixels (default: as rendered, for a gif at most 320)",
+    )
+    watching.add_argument(
+        "--max-seconds", type=float, metavar="S", help="length of the video. The evaluation ends with it"
+    )
+    watching.add_argument("--render", action="store_true", help="show the episodes in a window, at human speed")
 
 
 def main(
@@ -69,7 +164,7 @@ def main(
     )
     stop = stop or threading.Event()
     try:
-        check(arguments)
+        options = evaluation_options(arguments)
     except ValueError as error:
         print_error("evaluate", error)
         return 2
@@ -80,7 +175,7 @@ def main(
         exit_with_parent(stop)
     try:
         with redirect_stdout(sys.stderr):  # the environment may print
-            result = run_evaluation(arguments, stop, sys.stderr)
+            result = run_evaluation(options, stop, sys.stderr)
     except ModuleNotAllowedError as error:
         print_error("evaluate", allowing(error, ["daedalus", "evaluate", *words]))
         return 2
@@ -95,9 +190,35 @@ def main(
     return 0 if not arguments.record or _record(result, arguments.directory) else 1
 
 
+def evaluation_options(arguments: argparse.Namespace) -> EvaluationOptions:
+    """Return what the command line asks for. Raises ValueError for options that cannot be used."""
+    if arguments.record and arguments.directory is None:
+        raise ValueError("--record keeps the result in a run directory: name the directory of a run")
+    if arguments.record and arguments.max_seconds is not None:
+        raise ValueError("--record keeps whole episodes, and --max-seconds cuts them: use one of the two")
+    return EvaluationOptions(
+        directory=arguments.directory,
+        pretrained=arguments.pretrained,
+        from_hub=arguments.from_hub,
+        revision=arguments.revision,
+        newest=arguments.newest,
+        episodes=arguments.episodes,
+        seed=arguments.seed,
+        actions=arguments.actions,
+        backend=arguments.backend,
+        envs=arguments.envs,
+        wrap=arguments.wrap,
+        allowed_modules=frozenset(arguments.allow_module),
+        video=arguments.video,
+        width=arguments.width,
+        max_seconds=arguments.max_seconds,
+        render=arguments.render,
+    )
+
+
 def _record(result: dict[str, Any], directory: Path) -> bool:
     """Keep a result in a run directory, as the final evaluation does, and return whether that was possible."""
-    from daedalus.cli.evaluation_processes import evaluation_summary
+    from daedalus.launch.final_evaluation import evaluation_summary
     from daedalus.learner.run import run_directory  # a policy of another place needs no code of the learner
     from daedalus.learner.run.settings import SettingsError
 
@@ -122,135 +243,6 @@ def _reserved_stdout() -> TextIO:
     result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return result
-
-
-def run_evaluation(arguments: argparse.Namespace, stop: threading.Event, stream: TextIO) -> dict[str, Any]:
-    """Return the result of the evaluation that the arguments describe, after `check`; `stream` shows its progress."""
-    policy = find_policy(_directory(arguments), arguments.newest)
-    spec, modules = _environment(policy, arguments), _modules(policy, arguments)
-    modules.check(spec.user_modules)
-    seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
-    progress = EvaluationProgress(stream, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
-    filmed: dict[str, Any] = {}
-    notes: list[str] = []
-    try:
-        if arguments.video is None:
-            with Surroundings():
-                evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
-        else:
-            with (
-                Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video,
-                Surroundings(),
-            ):
-                evaluation = _play(policy, spec, modules, arguments, seed, progress, video)
-            filmed = {"video": str(arguments.video), "video_seconds": video.seconds}
-            if video.rate.guess:
-                notes.append(f"the speed of the video: {video.rate.guess}")
-    finally:
-        progress.end()
-    actions = _actions(policy, arguments)
-    result = _result(policy, spec, evaluation, actions)
-    return {**result, "notes": [*result["notes"], *notes], "seed": seed, "actions": actions, **filmed}
-
-
-def _directory(arguments: argparse.Namespace) -> Path:
-    """Return the run directory or checkpoint that the arguments name. Raises HubError, NoPolicyError."""
-    if arguments.from_hub is not None:
-        return pull(arguments.from_hub, arguments.revision)
-    return arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
-
-
-def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
-    """Return the environment to play: that of the training, on the backend of the evaluation."""
-    trained = policy.spec.environment
-    if arguments.wrap is not None:
-        trained = trained.model_copy(update={"wrap": None if arguments.wrap == "none" else arguments.wrap})
-    watched = arguments.video is not None or arguments.render
-    backend = arguments.backend or policy.spec.evaluation.final_backend or trained.backend
-    if watched:
-        backend = "gymnasium"
-    played = as_on_gymnasium(trained) if backend == "gymnasium" else trained.as_evaluated(backend)
-    return played.model_copy(update={"processes": played.processes and backend == "gymnasium" and not watched})
-
-
-def _modules(policy: SavedPolicy, arguments: argparse.Namespace) -> UserModules:
-    """Return the modules that the command line allows, with that of its own --wrap."""
-    own = {module_of(arguments.wrap)} if arguments.wrap not in (None, "none") else set()
-    source = f"the run of {arguments.from_hub or policy.directory}"
-    return UserModules(frozenset({*arguments.allow_module, *own}), source)
-
-
-def _play(
-    policy: SavedPolicy,
-    spec: EnvironmentSpec,
-    modules: UserModules,
-    arguments: argparse.Namespace,
-    seed: int,
-    progress: EvaluationProgress,
-    video: Video | None,
-) -> Evaluation:
-    episodes = arguments.episodes
-    watched = arguments.render or video is not None
-    environments = make_environments(
-        spec,
-        1 if watched else min(arguments.envs or environments_for(episodes, spec, policy.spec.collection), episodes),
-        modules=modules,
-        render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
-        camera=None if video is None else video.add,
-        one_episode=True,
-    )
-    try:
-        if environments.spaces != policy.spaces:
-            raise EnvironmentSetupError(
-                f"{spec.id} (backend {spec.backend}) has {environments.spaces}; the policy was trained on "
-                f"{policy.spaces}: choose another --backend, or install the versions that the run used (versions.json)"
-            )
-        runtime = OnnxRuntime(policy.program, progress.stop)
-        runtime.load(policy.weights)
-        return play_episodes(
-            runtime,
-            environments,
-            episodes,
-            seed,
-            sampled=_actions(policy, arguments) == "sampled",
-            longest=policy.spec.evaluation.max_episode_env_steps,
-            progress=lambda finished, mean: progress(finished, mean) or (video is not None and video.is_full),
-        )
-    finally:
-        environments.close()
-
-
-def _actions(policy: SavedPolicy, arguments: argparse.Namespace) -> str:
-    return arguments.actions or policy.spec.evaluation.actions
-
-
-def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation, actions: str) -> dict[str, Any]:
-    returns = evaluation.returns
-    note = _note(evaluation, policy.spec.evaluation.max_episode_env_steps, sampled=actions == "sampled")
-    return {
-        "environment": spec.id,
-        "backend": spec.backend,
-        "checkpoint": str(policy.directory),
-        "best_checkpoint": is_best(policy.directory),
-        "policy_version": policy.policy_version,
-        "episodes": len(returns),
-        "notes": [note] if note else [],
-        "return_mean": float(returns.mean()),
-        "return_std": float(returns.std()),
-        "return_min": float(returns.min()),
-        "return_max": float(returns.max()),
-        "length_mean": float(evaluation.lengths.mean()),
-        "returns": returns.tolist(),
-        "lengths": evaluation.lengths.tolist(),
-    }
-
-
-def _note(evaluation: Evaluation, longest: int, *, sampled: bool) -> str:
-    """Return a message about episodes that were cut, or an empty string."""
-    cut = int((evaluation.cut & (evaluation.lengths == longest)).sum())
-    if cut:
-        return cut_note(cut, len(evaluation.cut), longest, sampled=sampled)
-    return "the last episode was cut at the end of the video" if evaluation.cut.any() else ""
 
 
 def _text(result: dict[str, Any]) -> str:

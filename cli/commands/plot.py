@@ -8,7 +8,7 @@ from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS
 from daedalus.analysis.run_groups import select
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
-from daedalus.cli.logs import print_error, say
+from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\

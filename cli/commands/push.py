@@ -4,8 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from daedalus.cli.arguments import command_parser
-from daedalus.cli.logs import add_logging, configure_logging, print_error, say
+from daedalus.cli.arguments import add_logging, command_parser
+from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.hub import HubError, RepositoryNameError
 from daedalus.policy.saving.saved_policy import NoPolicyError

@@ -9,7 +9,7 @@ from daedalus.analysis.run_groups import select
 from daedalus.analysis.run_report import comparison_page, run_page
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
-from daedalus.cli.logs import print_error, say
+from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.regular_files import replace_text
 

@@ -4,10 +4,9 @@ import argparse
 import logging
 import math
 
-from daedalus.cli.arguments import add_insecure, add_tls, command_parser
-from daedalus.cli.logs import add_logging, configure_logging, print_error
-from daedalus.cli.processes import raise_descriptor_limit, status_at_start, stop_on_signals
-from daedalus.cli.settings_arguments import LISTEN
+from daedalus.cli.arguments import add_insecure, add_logging, add_tls, command_parser
+from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.process_lifecycle import raise_descriptor_limit, status_at_start, stop_on_signals
 from daedalus.transport.addresses import check_connecting, reachable
 from daedalus.transport.connecting import listen
 from daedalus.transport.credentials import SECURITY_ERRORS, CredentialsError, credentials_to_listen
@@ -15,6 +14,8 @@ from daedalus.transport.interface import TransportError
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _logger = logging.getLogger(__name__)
+
+LISTEN = "tcp/127.0.0.1:7447"
 
 _DESCRIPTION = """\
 Forwards the traffic between a learner and its actors. With a router of its own, a learner can restart or move to

@@ -15,8 +15,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.logs import print_error, say
-from daedalus.cli.processes import BAD_USAGE
+from daedalus.launch.logs import print_error, say
+from daedalus.launch.process_lifecycle import BAD_USAGE
 from daedalus.protocol.models import meanings
 from daedalus.protocol.spec import RunSpec
 

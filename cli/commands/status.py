@@ -2,15 +2,17 @@
 
 import argparse
 import json
+import threading
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.logs import print_error, say
-from daedalus.cli.processes import status_at_start
-from daedalus.cli.status_query import ask, ask_events, no_answer
-from daedalus.cli.watching.screen import Screen
-from daedalus.cli.watching.status_watch import watch_status
+from daedalus.cli.run_watcher import looks
+from daedalus.cli.screen import Screen
+from daedalus.launch.logs import print_error, say
+from daedalus.launch.process_lifecycle import status_at_start
 from daedalus.learner.run.heartbeat import HEARTBEAT, silence
 from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.run_lock import LOCK
@@ -20,9 +22,11 @@ from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, Run
 from daedalus.protocol.texts import one_line, printable, short_number
 from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
-from daedalus.transport.interface import TransportError
+from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.status_query import ask, ask_events, no_answer
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
+_FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0  # between two looks
 
 _DESCRIPTION = """\
 Shows the state of the learners at an address and of their actors. The exit status serves as a health check: a learner
@@ -119,6 +123,38 @@ def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
     connect = partial(connect_until_interrupted, parsed.connect, credentials)
     watch_status(connect, parsed.run, screen, shown, frames=frames)
     return HEALTHY
+
+
+def watch_status(
+    connect: Callable[[], Transport], run: str, screen: Screen, text: Callable[[RunStatus], str], *, frames: bool
+) -> None:
+    """Show the runs until Ctrl-C.
+
+    Args:
+      connect: opens the transport. Raises TransportError.
+      run: name of the run, or `*` for all runs.
+      screen: where to show them.
+      text: returns what is printed about a run where no frames are shown.
+      frames: redraw one frame.
+
+    Raises TransportError if the learner refuses this process, or if its answers are damaged.
+    """
+    wanted = "no learner" if run == keys.ANY_RUN else f"no learner of run {run!r}"
+    nobody, waiting = f"{wanted} answers at this address; waiting for one (Ctrl-C ends)", False
+    with suppress(KeyboardInterrupt):
+        try:
+            for runs in looks(connect, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+                if frames and runs:
+                    screen.show(runs)
+                elif frames:
+                    screen.say(nobody)
+                elif not runs and not waiting:
+                    screen.err(f"daedalus status: {nobody}")
+                for each in runs if not frames else ():
+                    screen.out(text(each.status))
+                waiting = not runs
+        finally:
+            screen.end()
 
 
 def _check_alive(directory: Path) -> int:

@@ -1,7 +1,6 @@
 """`daedalus sweep`: train runs of several settings and seeds on this machine, and compare them."""
 
 import argparse
-import copy
 import re
 import shlex
 import signal
@@ -12,18 +11,17 @@ from pathlib import Path
 import tomli_w
 
 from daedalus.analysis.sweep_execution import Display, RunProcesses, Sweep, report
-from daedalus.analysis.sweep_plan import Axis, Choices, Planner, Point, read_axis
+from daedalus.analysis.sweep_plan import Axis, Choices, Planner, read_axis
 from daedalus.analysis.sweep_search import INSTALL, GridSearch, SampledSearch, Search, import_optuna
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.logs import configure_logging, print_error, say
-from daedalus.cli.processes import stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
-from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
+from daedalus.cli.settings_arguments import add_log, add_settings, run_choice
+from daedalus.launch.environment_check import EnvironmentProblemError, checked_defaults, checked_spaces
+from daedalus.launch.logs import configure_logging, print_error, say
+from daedalus.launch.process_lifecycle import stop_on_signals
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.regular_files import replace_text
-from daedalus.protocol.spec import RunSpec
 
 _DESCRIPTION = """\
 Trains runs of several settings, each with several seeds, one after another or side by side (--jobs). Ends with a table
@@ -75,7 +73,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--sampler",
         action="store_true",
-        help="let Optuna choose the values, in place of all combinations (needs the extra sweep)",
+        help="let Optuna choose the values, in place of all combinations (needs the extra analysis)",
     )
     options.add_argument(
         "--trials", type=_count, metavar="N", help="number of settings that --sampler tries (default: 20)"
@@ -156,36 +154,13 @@ def _planner(parsed: argparse.Namespace, folder: Path) -> tuple[Planner, range]:
 
     Raises SettingsError, EnvironmentProblemError.
     """
-    spec, defaults = resolve_spec(parsed), None
-    if parsed.env is None:
-        checked_spaces(spec, fork=True)
+    choice, defaults = run_choice(parsed), None
+    if choice.env is None:
+        checked_spaces(choice.spec(), fork=True)
     else:
-        _, defaults = checked_defaults(spec, fork=True)
-
-    def settings(point: Point, seed: int) -> tuple[RunSpec, list[str]]:
-        options = with_point(parsed, point, seed)
-        return resolve_spec(options, defaults), train_words(options)
-
-    first = resolve_spec(parsed, defaults).training.seed
-    return Planner(folder, settings), range(first, first + parsed.seeds)
-
-
-def with_point(parsed: argparse.Namespace, point: Point, seed: int) -> argparse.Namespace:
-    """Return the options with the settings of a point."""
-    options = copy.copy(parsed)
-    options.seed = seed
-    options.set = [*parsed.set, *(f"{key}={value}" for key, value in point.items())]
-    return options
-
-
-def train_words(options: argparse.Namespace) -> list[str]:
-    """Return the words of the command line that trains with these options, after `daedalus`."""
-    words = ["train", *([options.preset] if options.preset is not None else [])]
-    for name in ("env", "algorithm", "actors", "seed", "env_steps", "wrap"):
-        value = getattr(options, name)
-        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
-    words += [word for tracker in options.log for word in ("--log", tracker)]
-    return [*words, *(word for assignment in options.set for word in ("--set", assignment))]
+        _, defaults = checked_defaults(choice.spec(), fork=True)
+    first = choice.spec(defaults).training.seed
+    return Planner(choice, parsed.log, folder, defaults), range(first, first + parsed.seeds)
 
 
 def _locked(folder: Path) -> RunLock:

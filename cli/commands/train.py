@@ -1,50 +1,51 @@
 """`daedalus train` and `daedalus resume`: train with a learner and actors on this machine, and evaluate the policy."""
 
 import argparse
+import importlib.util
+import shlex
 import signal
 import sys
-from functools import partial
-from importlib.util import find_spec
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from daedalus.cli.arguments import (
     add_allow_module,
     add_insecure,
+    add_logging,
     add_reset_statistics,
     add_tls,
     allowing,
     command_parser,
+    log_options,
     whole_number,
 )
-from daedalus.cli.child_output import ChildOutput, inherited
-from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
-from daedalus.cli.logs import add_logging, configure_logging, print_error, say
-from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.processes import exit_with_parent, process_started, status_at_start, stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
-from daedalus.cli.run_report import report, show
-from daedalus.cli.running.local_run import (
+from daedalus.cli.screen import Screen, TrainingDisplay
+from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, new_run
+from daedalus.launch.child_output import ChildOutput, inherited
+from daedalus.launch.environment_check import EnvironmentProblemError, checked_spaces
+from daedalus.launch.local_run import (
     LocalRun,
     RunFailedError,
     RunStoppedError,
     UnsavedError,
     resume_command,
 )
-from daedalus.cli.running.new_run import prepare
-from daedalus.cli.running.run_locally import run_locally
-from daedalus.cli.running.run_observer import RunObserver
-from daedalus.cli.settings_arguments import (
-    add_log,
-    add_new_run,
-    add_settings,
-    named_directory,
-    resolve_spec,
+from daedalus.launch.local_training import run_locally
+from daedalus.launch.logs import print_error, say
+from daedalus.launch.process_lifecycle import (
+    UNWRITABLE,
+    discard,
+    exit_with_parent,
+    process_started,
+    status_at_start,
+    stop_on_signals,
 )
-from daedalus.cli.watching.screen import Screen
-from daedalus.cli.watching.training_display import TrainingDisplay
+from daedalus.launch.run_choice import create_run, with_record
 from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.resuming import FinishedRun, check_initial, finished_run, initial_to_resume, with_changes
+from daedalus.learner.run.resuming import finished_run, initial_to_resume, with_changes
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
@@ -54,8 +55,8 @@ from daedalus.policy.user_modules import (
     UserModuleError,
     UserModules,
 )
-from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import exact_number, short_number
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
 
 _TRAIN = """\
@@ -104,23 +105,13 @@ def train(arguments: list[str]) -> int:
     started = process_started()
     parsed = train_parser().parse_args(arguments)
     screen = Screen()
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=screen.out)
+    log_options(parsed).configure(write=screen.out)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
         _check_watching(parsed)
-        if parsed.run_dir is not None:
-            run_directory.check_free(parsed.run_dir)  # before the environment is made
-        check_initial(parsed.init_from, other_spaces=parsed.allow_other_spaces)
-        spec, spaces = prepare(partial(resolve_spec, parsed), env=parsed.env, fork=True)
-        directory = parsed.run_dir or named_directory(parsed.preset, spec)
-        lock = run_directory.create_locked(
-            directory,
-            spec,
-            numbered=parsed.run_dir is None,
-            init_from=parsed.init_from,
-            other_spaces=parsed.allow_other_spaces,
-        )
+        new = new_run(parsed)
+        lock, spec, spaces = create_run(new, fork=True)
     except (RunInUseError, EnvironmentProblemError) as error:
         print_error("train", error)
         return 1
@@ -128,7 +119,16 @@ def train(arguments: list[str]) -> int:
         print_error("train", error)
         return status_at_start(error)
     with lock:
-        return _run(lock, spec, parsed, started, screen, parsed.init_from, resume=False, spaces=spaces)
+        run = LocalRun(
+            directory=lock.directory,
+            spec=spec,
+            started=started,
+            lock=lock.inheritable,
+            spaces=spaces,
+            init_from=new.init_from,
+            **_machine_options(parsed, lock.directory),
+        )
+        return _run(run, screen, exits_with_parent=parsed.exit_with_parent)
 
 
 def resume(arguments: list[str]) -> int:
@@ -136,7 +136,7 @@ def resume(arguments: list[str]) -> int:
     started = process_started()
     parsed = resume_parser().parse_args(arguments)
     screen = Screen()
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=screen.out)
+    log_options(parsed).configure(write=screen.out)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
@@ -165,7 +165,19 @@ def resume(arguments: list[str]) -> int:
         except (EnvironmentProblemError, SettingsError) as error:
             print_error("resume", error)
             return 1
-        return _run(lock, spec, parsed, started, screen, init_from, resume=True, spaces=spaces, finished=finished)
+        run = LocalRun(
+            directory=lock.directory,
+            spec=spec,
+            started=started,
+            lock=lock.inheritable,
+            spaces=spaces,
+            init_from=init_from,
+            resume=True,
+            reset_statistics=parsed.reset_statistics,
+            trained=None if finished is None else _MISSED if finished.missed else 0,
+            **_machine_options(parsed, lock.directory),
+        )
+        return _run(run, screen, exits_with_parent=parsed.exit_with_parent)
 
 
 def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
@@ -238,7 +250,11 @@ def _check_watching(parsed: argparse.Namespace) -> None:
     """Raise SettingsError if the gateway's packages are missing, or there is no gateway."""
     if parsed.clients and not parsed.watch:
         raise SettingsError("--clients is for the page of the run: add --watch, or start `daedalus gateway`")
-    if parsed.watch and not all(map(find_spec, GATEWAY_PACKAGES)):
+    if not parsed.watch:
+        return
+    from daedalus.launch.gateway_process import GATEWAY_PACKAGES, INSTALL  # with what a gateway imports
+
+    if not all(map(importlib.util.find_spec, GATEWAY_PACKAGES)):
         raise SettingsError(f"--watch: {INSTALL}")
 
 
@@ -246,47 +262,31 @@ def _check_listening(parsed: argparse.Namespace) -> None:
     credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
 
 
-def _run(
-    lock: RunLock,
-    spec: RunSpec,
-    parsed: argparse.Namespace,
-    started: float,
-    screen: Screen,
-    init_from: Path | None,
-    *,
-    resume: bool,
-    spaces: Spaces | None = None,
-    finished: FinishedRun | None = None,
-) -> int:
+def _machine_options(parsed: argparse.Namespace, directory: Path) -> dict[str, Any]:
+    """Return the fields of a LocalRun that `_add_machine_options` and `add_log` define."""
+    return {
+        "listen": parsed.listen,
+        "tls": parsed.tls,
+        "insecure": parsed.insecure,
+        "watch": parsed.watch,
+        "clients": parsed.clients,
+        "camera": not parsed.no_camera,
+        "log": chosen_trackers(parsed.log, directory),
+        "logs": log_options(parsed),
+    }
+
+
+def _run(run: LocalRun, screen: Screen, *, exits_with_parent: bool) -> int:
     """Run to the end, print the result, and return the exit status. A finished run is only evaluated."""
-    directory = lock.directory
-    live = screen.shows_frames and not parsed.log_json
-    command = "daedalus resume" if resume else "daedalus train"
-    run = LocalRun(
-        directory=directory,
-        spec=spec,
-        started=started,
-        lock=lock.inheritable,
-        spaces=spaces,
-        init_from=init_from,
-        resume=resume,
-        reset_statistics=resume and parsed.reset_statistics,
-        trained=None if finished is None else _MISSED if finished.missed else 0,
-        listen=parsed.listen,
-        tls=parsed.tls,
-        insecure=parsed.insecure,
-        watch=parsed.watch,
-        clients=parsed.clients,
-        camera=not parsed.no_camera,
-        log=chosen_trackers(parsed.log, directory),
-        log_level=parsed.log_level,
-        log_json=parsed.log_json,
-        observer=TrainingDisplay(screen, run_directory.run_name(directory)) if live else RunObserver(),
-    )
+    directory = run.directory
+    live = screen.shows_frames and not run.logs.as_json
+    command = "daedalus resume" if run.resume else "daedalus train"
+    if live:
+        run = replace(run, observer=TrainingDisplay(screen, run_directory.run_name(directory)))
     output = ChildOutput(directory / run_directory.OUTPUT, screen.out, screen.err)
     # A disk that does not answer may hold this thread. The child processes then end with this one, by themselves.
     stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=_DISK_SECONDS, end_seconds=_END_SECONDS)
-    if parsed.exit_with_parent:
+    if exits_with_parent:
         exit_with_parent(stopping)
     try:
         with output:
@@ -297,10 +297,65 @@ def _run(
     except RunFailedError as error:
         if str(error):
             say(f"{command}: {str(error).rstrip()}", sys.stderr)
-        if not (resume or output.withheld or isinstance(error, UnsavedError)):
+        if not (run.resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
         if not isinstance(error, UnsavedError) and checkpoints(directory):
             say(f"when that is corrected, continue with: {resume_command(run)}", sys.stderr)
         return error.status
     show(report(run, end.summary), command)
     return end.status
+
+
+def report(run: LocalRun, summary: dict[str, Any]) -> str:
+    """Return the result of a run from its summary.json, with the evaluation."""
+    target = run.spec.training.target_return
+    skipped = f" ({summary['updates_skipped']:,} skipped)" if summary.get("updates_skipped") else ""
+    updates = f"{summary['updates']:,} updates{skipped}"
+    if summary["solved"]:
+        trained = (
+            f"solved: mean return {exact_number(target)} reached after {summary['seconds_to_target']:.1f} s; "
+            f"{summary['env_steps']:,} env_steps, {updates} in all"
+        )
+    else:
+        goal = "" if target is None else f" (the target {exact_number(target)} was not reached)"
+        trained = f"done: {summary['env_steps']:,} env_steps, {updates}{goal}"
+    evaluation = summary["evaluation"]
+    evaluated = (
+        f"evaluation: return {short_number(evaluation['return_mean'])} +- {short_number(evaluation['return_std'])} "
+        f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
+        f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
+        f"on {evaluation['environment']} (backend {evaluation['backend']})"
+    )
+    folder = f"run directory: {run.directory}"
+    if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
+        folder += f"; draw the curves with: daedalus plot {shlex.quote(str(run.directory))} --output curve.png"
+    return "\n".join([trained, *_confirmed(run, summary), evaluated, *evaluation["notes"], folder])
+
+
+def show(text: str, command: str) -> None:
+    """Print the result of a run. A full disk is no fault of the run: standard error has one line of `command` then."""
+    try:
+        say(text)
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        discard(sys.stdout)
+        with suppress(OSError):
+            message = f"cannot print the result, which is in the run directory: {error.strerror}"
+            say(f"{command}: {message}", sys.stderr)
+
+
+def _confirmed(run: LocalRun, summary: dict[str, Any]) -> list[str]:
+    """Return the line about the new episodes that confirm "solved", if there is one."""
+    confirmation = summary.get("confirmation")
+    if confirmation is None:
+        return []
+    line = (
+        f"confirmation: return {short_number(confirmation['return_mean'])} over {confirmation['episodes']} new sampled "
+        "episodes of the policy at that moment"
+    )
+    if confirmation["interval"] is not None:
+        line += ", 95 % interval {} to {}".format(*map(short_number, confirmation["interval"]))
+    if run.spec.environment.trains_true_task:
+        line += f"; training mean {short_number(summary['episode_return_mean'])}"
+    return [line]

@@ -36,10 +36,6 @@ class Annealing(BaseModel, frozen=True, strict=True, extra="forbid"):
             return self
         return Annealing(budget=budget, env_steps=env_steps, progress=self.at(env_steps))
 
-    def state(self) -> dict[str, Any]:
-        """Return the fields as plain JSON values."""
-        return self.model_dump()
-
 
 def updates_of(training: TrainingSpec, uploads: Sequence[Upload], *, memory: bool) -> int:
     """Return the number of policy versions that a batch of these uploads makes; `memory`: the policy has one."""
@@ -66,7 +62,7 @@ _COUNTS = TypeAdapter(dict[str, _Count], config={"strict": True})  # of _SAVED
 
 
 class _State(BaseModel, strict=True):
-    """The other values of RunCounters.state, and what RunState adds."""
+    """The other values of RunCounters.state, and what RunContext.saved adds."""
 
     rollouts_rejected: dict[str, _Count]
     best_evaluation: float | None = None  # absent in checkpoints of earlier releases

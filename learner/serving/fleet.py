@@ -1,9 +1,9 @@
 """The actors of a run: joins, presence, incarnations. No I/O.
 
 An actor that is absent for a minute is forgotten; the totals of the run keep its counts. What is remembered of it
-longer, so that no rollout is trained on twice, is in former_incarnations.py.
+longer, so that no rollout is trained on twice, is in FormerIncarnations.
 
-The lock of the actor server guards all of it.
+The lock of the run guards all of it.
 """
 
 import hashlib

@@ -147,7 +147,7 @@ class BarrierBuffer:
     """Buffer of a synchronous algorithm: a batch is one rollout of every live actor, sorted by name.
 
     The first batch also waits for `first` live actors. A batch does not wait for an actor that has left or that is
-    overdue (stragglers.py), but contains its rollout of the current version. A batch that fills `most_bytes` is
+    overdue (Stragglers), but contains its rollout of the current version. A batch that fills `most_bytes` is
     complete, too: one peer may join under many names, and send rollouts of zeros, which compress to nothing.
     """
 

@@ -8,8 +8,8 @@ While the learner computes a batch, answers to accepted rollouts wait until it a
 its next rollout with the snapshot of that batch: without the wait, actors would play far ahead of a learner that is
 slower than they are, and rollouts would have a larger policy lag.
 
-One condition, shared with the actor server, guards the fleet, the buffer, the counters and the version that the policy
-lag of rollouts is relative to.
+The lock of the run guards the fleet, the buffer, the counters and the version that the policy lag of rollouts is
+relative to.
 """
 
 import logging

@@ -90,7 +90,7 @@ def _weight_gradient(inner: Tensor, inputs: Tensor, width: int) -> Tensor:
     """Return the gradient of the weights of a layer [units, width], from that of its outputs [N, units]."""
     if inputs.dtype != torch.int64:
         # Few columns on the right take several times longer than few rows on the left.
-        return inner.t() @ inputs if width >= inner.shape[1] else (inputs.t() @ inner).t()
+        return inner.t() @ inputs if 4 * width > inner.shape[1] else (inputs.t() @ inner).t()
     columns = inputs.shape[1]
     each = inner if columns == 1 else inner.repeat_interleave(columns, 0)
     return torch.ops.aten.embedding_dense_backward(each, inputs.flatten(), width, -1, False).t()

@@ -358,10 +358,6 @@ def test_environments_are_kept_if_the_backend_makes_fewer_than_requested() -> No
     assert make.call_count == 1
 
 
-def test_a_rollout_can_be_collected_at_any_time() -> None:
-    assert EnvironmentCollector().has_rollout()
-
-
 # --------------------------------------------------------------------------- observations that the learner refuses
 
 

@@ -13,7 +13,7 @@ from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_
 
 from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session.origin import own_origin
+from daedalus.actor.session.actor_config import own_origin
 from daedalus.protocol.messages import Join, Refusal
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

@@ -10,8 +10,8 @@ import pytest
 from scripted_learner import SPACES, Policy, ScriptedLearner
 
 from daedalus.actor.collecting.client_collector import ClientCollector
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import Snapshot

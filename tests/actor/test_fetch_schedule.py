@@ -2,7 +2,7 @@
 
 import pytest
 
-from daedalus.actor.session.fetch_schedule import FetchSchedule
+from daedalus.actor.session.snapshots import FetchSchedule
 
 
 def played(schedule: FetchSchedule, *, start: float, seconds: float, row: float, fetch: float = 0.0) -> list[float]:

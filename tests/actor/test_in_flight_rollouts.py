@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
+from daedalus.actor.session.uploading import InFlightRollouts
 from daedalus.protocol.messages import Acknowledgement
 
 

@@ -1,11 +1,11 @@
-"""actor/session/own_name.py: names of actors that were given none."""
+"""actor/session/actor_config.py: names of actors that were given none."""
 
 import os
 import socket
 
 import pytest
 
-from daedalus.actor.session.own_name import own_name
+from daedalus.actor.session.actor_config import own_name
 from daedalus.protocol import keys
 
 

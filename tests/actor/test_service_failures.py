@@ -1,22 +1,18 @@
 """ActorService against a scripted learner, over the memory transport: failures, refusals and the end of the run."""
 
-import contextlib
 import socket
 import struct
-import threading
 
 import pytest
 from log_lines import LINES
 from processes import LIMIT, until
-from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
+from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
 
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session import learner_queries, runtime_maker, service, session_monitor
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
-from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome, new_epoch
-from daedalus.transport.interface import RefusedError, TransportError
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, Welcome
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
@@ -40,6 +36,16 @@ def test_actor_joins_again_after_the_learner_restarted(network: MemoryNetwork, a
     assert any("went away" in text for text in LINES)
 
 
+def test_drained_actor_ends(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    acknowledge(request, "drained")
+    actor.join()
+    assert actor.error is None
+    assert LINES[-1] == "an operator drained this actor: it leaves the run"
+
+
 @pytest.mark.parametrize("how", ["run_ended", "finished"])
 def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
     learner = ScriptedLearner(network)
@@ -55,24 +61,6 @@ def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningA
     actor.join()
     assert actor.error is None
     assert LINES[-1].startswith("the run is over")
-
-
-@pytest.mark.parametrize("how", ["verdict", "refused join"])
-def test_drained_actor_ends(
-    network: MemoryNetwork, actor: RunningActor, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The join is refused if the actor sends nothing, because it waits for the other actors of a2c."""
-    monkeypatch.setattr(session_monitor, "_SILENCE_SECONDS", 1e6 if how == "verdict" else 0.1)
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    _, request = learner.receive()
-    if how == "verdict":
-        acknowledge(request, "drained")
-    else:
-        learner.refusal = Refusal(code="drained", reason="why")
-    actor.join()
-    assert actor.error is None
-    assert LINES[-1] == "an operator drained this actor: it leaves the run"
 
 
 def test_damaged_message_is_logged_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
@@ -144,7 +132,7 @@ def test_unexpected_error_is_reported_with_its_type(network: MemoryNetwork, monk
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a fault of a simulator")
 
-    monkeypatch.setattr(service.ActorService, "_collect", fail)
+    monkeypatch.setattr(EnvironmentCollector, "collect", fail)
     learner = ScriptedLearner(network)
     actor = RunningActor(network)
     learner.publish(0)
@@ -166,20 +154,6 @@ def test_actor_whose_rollouts_the_learner_cannot_take_ends_with_the_setting_to_r
     assert learner.rollouts.empty()
 
 
-def test_actor_ends_with_the_reason_when_its_certificate_is_refused(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def reopen(_: MemoryTransport) -> bool:
-        raise RefusedError("the certificate expired on 2030-01-01: renew it")
-
-    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
-    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.02)
-    actor = RunningActor(network)
-    actor.join()
-    assert isinstance(actor.error, ActorError)
-    assert str(actor.error) == "the certificate expired on 2030-01-01: renew it"
-
-
 def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     for run in ("one", "two"):
         transport = MemoryTransport(network)
@@ -188,49 +162,6 @@ def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     actor = RunningActor(network)
     actor.join()
     assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
-
-
-def test_actors_keep_to_the_newer_of_two_learners_of_one_run(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    older, newer = ScriptedLearner(network, epoch=new_epoch(1)), ScriptedLearner(network, epoch=new_epoch(2))
-    older.publish(0)
-    newer.publish(0, push=False)
-    actor = RunningActor(network)
-    until(lambda: any(line.startswith("2 learners of run 'r' answer") for line in LINES))
-    until(lambda: "waiting for the older learner to step down" in LINES)
-    assert older.rollouts.empty()
-    older.transport.close()
-    assert newer.receive()[0].identity.learner_epoch == newer.epoch
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
-
-
-def test_an_older_learner_that_does_not_step_down_is_not_waited_for(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(learner_queries, "_STEP_DOWN_SECONDS", 0.05)
-    older, newer = ScriptedLearner(network, epoch=new_epoch(1)), ScriptedLearner(network, epoch=new_epoch(2))
-    transport = MemoryTransport(network)
-    end = RunEndWatch(transport, threading.Event())
-    join = Join(actor="a", incarnation=1)
-    welcome = learner_queries.LearnerQueries(transport).join_learner("*", join, None, end)
-    assert welcome.learner_epoch == newer.epoch
-    assert older.epoch < newer.epoch
-
-
-@pytest.mark.parametrize(("starts", "is_over"), [(1, False), (2, True), (3, True)])
-def test_only_an_older_learner_cannot_say_that_the_run_is_over(
-    network: MemoryNetwork, starts: int, is_over: bool
-) -> None:
-    """Two processes that resumed from the same checkpoint differ in random bits only: either may end the run."""
-    end = RunEndWatch(MemoryTransport(network), threading.Event())
-    end.follow("r", new_epoch(2))
-    finished = RunEnded(learner_epoch=new_epoch(starts), outcome="finished", reason="solved")
-    MemoryTransport(network).publish(keys.run_end("r"), encode(finished))
-    with pytest.raises(RunOverError) if is_over else contextlib.nullcontext():
-        end.check()
 
 
 @pytest.mark.parametrize("others", [0, 1])
@@ -274,30 +205,6 @@ def test_actor_that_waits_for_another_run_names_the_runs_that_are_there(network:
     assert all(learner.joins.get(timeout=LIMIT).spaces is None for learner in learners)
 
 
-@pytest.mark.parametrize("any_run", [False, True])
-def test_actor_stays_with_the_run_that_it_joined_first_unless_told_otherwise(
-    network: MemoryNetwork, any_run: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(learner_queries, "_LOOK_AROUND_SECONDS", 0.1)
-    first = ScriptedLearner(network, run="first")
-    actor = RunningActor(network, any_run=any_run)
-    first.publish(0)
-    first.receive()
-    other = ScriptedLearner(network, run="other", epoch=2)
-    other.publish(0)
-    first.transport.close()
-    if any_run:
-        assert other.receive()[0].identity.learner_epoch == 2
-    else:
-        until(lambda: "waiting for a learner of run 'first'; the runs here are 'other'" in LINES)
-        again = ScriptedLearner(network, run="first", epoch=3)
-        again.publish(0)
-        assert again.receive()[0].identity.learner_epoch == 3
-        assert other.rollouts.empty()
-    actor.stop.set()
-    actor.join()
-
-
 def test_actor_ends_after_its_timeout_without_a_learner(network: MemoryNetwork) -> None:
     actor = RunningActor(network, timeout=0.05)
     actor.join()
@@ -330,89 +237,3 @@ def test_consecutive_rejections_are_warned_of_once_with_the_reason(network: Memo
     (warning,) = [line for line in LINES if "rejected the last" in line]
     assert "policy lag 31, at most 30 is allowed" in warning
     assert "max_policy_lag" in warning
-
-
-def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
-    network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(session_monitor, "_SILENCE_SECONDS", 0.1)
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    held = [learner.receive(), learner.receive()]  # never answered
-    assert learner.joins.get(timeout=LIMIT).spaces is None
-    assert learner.joins.get(timeout=LIMIT).spaces == SPACES
-    for _ in range(3):
-        assert learner.joins.get(timeout=LIMIT).spaces is None  # the probe is answered: the learner is only slow
-    assert not any("went away" in text for text in LINES)
-    learner.transport.serve(keys.join("r", "*"), lambda request: request.reply(b""))  # no valid message
-    until(lambda: any("went away" in text for text in LINES))
-    learner.transport.serve(keys.join("r", "*"), learner._join)
-    again = learner.receive()
-    assert again[0].identity in [rollout.identity for rollout, _ in held]  # the same rollout again
-
-
-def test_actor_reopens_its_transport_while_nobody_answers(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
-    reopened = threading.Semaphore(0)
-
-    def reopen(transport: MemoryTransport) -> bool:
-        reopened.release()
-        raise TransportError("nothing answers there")
-
-    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
-    actor = RunningActor(network)
-    for _ in range(3):
-        assert reopened.acquire(timeout=LIMIT)
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    learner.receive()
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
-
-
-def test_actor_that_is_stopped_while_its_transport_is_reopened_ends(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
-    reopening, ended = threading.Event(), threading.Event()
-
-    def reopen(transport: MemoryTransport) -> bool:
-        reopening.set()
-        return ended.wait(LIMIT)
-
-    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
-    actor = RunningActor(network)
-    assert reopening.wait(LIMIT)
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
-    assert not ended.is_set()
-    ended.set()
-
-
-@pytest.mark.parametrize("stopped_in", ["join", "program"])
-def test_an_actor_that_is_stopped_during_a_query_sends_no_other_query(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch, stopped_in: str
-) -> None:
-    """Each query may take 5 s, and a process has 5 s to end."""
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    actor = RunningActor(network, begin=False)
-    monkeypatch.setattr(runtime_maker, "_SLOW_LINK_SECONDS", -LIMIT)  # the link is measured by several queries
-    query, sent = actor.transport.query, list[str]()
-
-    def stopping_query(key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
-        sent.append(key)
-        if f"/{stopped_in}" in key:
-            actor.stop.set()
-        return query(key, payload, timeout=timeout)
-
-    monkeypatch.setattr(actor.transport, "query", stopping_query)
-    actor.begin()
-    actor.join()
-    assert actor.error is None
-    assert [f"/{stopped_in}" in key for key in sent].count(True) == 1
-    assert f"/{stopped_in}" in sent[-1]

@@ -10,47 +10,23 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.actor.session import learner_queries, runtime_maker, service, snapshot_feed, snapshot_source
-from daedalus.actor.session.config import LinkChoice
+from daedalus.actor.session import conversation, session_engine
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Message, Snapshot
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
-from daedalus.transport.interface import Inbox
-from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork
 
 
 def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(network: MemoryNetwork) -> None:
     actor = RunningActor(network, link="wan")
     learner = ScriptedLearner(network)
     learner.publish(3)
-    received = [learner.receive() for _ in range(service._SLOW_LINK_WINDOW)]  # a dropped request would be sent again
+    received = [learner.receive() for _ in range(session_engine._SLOW_LINK_WINDOW)]  # a dropped one is sent again
     assert [rollout.policy_version for rollout, _ in received] == [3] * len(received)
     assert [rollout.identity.sequence for rollout, _ in received] == list(range(len(received)))
     assert learner.rollouts.empty()
-    actor.stop.set()
-    actor.join()
-
-
-def test_actor_never_subscribes_on_a_link_measured_as_slow(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    followed: list[str] = []
-    subscribe = MemoryTransport.subscribe
-
-    def noted(transport: MemoryTransport, key: str, on_news: Callable[[], None]) -> Inbox:
-        followed.append(key)
-        return subscribe(transport, key, on_news)
-
-    monkeypatch.setattr(MemoryTransport, "subscribe", noted)
-    monkeypatch.setattr(runtime_maker, "_SLOW_LINK_SECONDS", -LIMIT)
-    learner = ScriptedLearner(network)
-    learner.publish(3)
-    actor = RunningActor(network)
-    assert learner.receive()[0].policy_version == 3
-    assert any(text.startswith("slow link: ") for text in LINES)
-    assert followed == [keys.run_end("r")]
     actor.stop.set()
     actor.join()
 
@@ -100,45 +76,6 @@ def test_actor_fetches_its_snapshots_once_or_twice_for_a_rollout_and_is_pushed_n
     assert subscriptions == {keys.run_end("r")}
 
 
-def test_actor_with_slow_rollouts_fetches_differences(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three slow rollouts in a row; then differences, as promptly as whole snapshots."""
-    monkeypatch.setattr(snapshot_source, "_SLOW_SECONDS", 0.0)
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    actor = RunningActor(network)
-    played = []
-    for version in range(1, 21):
-        rollout, request = learner.receive()
-        played.append(rollout.policy_version)
-        learner.publish(version)
-        acknowledge(request, "accepted", version)
-    assert len(learner.fetches) <= 8  # whole snapshots, before the actor knows how long a rollout takes
-    assert any(fetch.held_version is not None for fetch in learner.compact_fetches)
-    assert played == sorted(played)
-    assert played[-1] >= 17  # two rollouts are in flight
-    actor.stop.set()
-    actor.join()
-
-
-@pytest.mark.parametrize("link", ["lan", "auto"])
-def test_actor_fetches_no_differences_of_a_large_network_or_if_told_otherwise(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch, link: LinkChoice
-) -> None:
-    monkeypatch.setattr(snapshot_source, "_SLOW_SECONDS", 0.0)
-    if link == "auto":
-        monkeypatch.setattr(snapshot_feed, "_SMALL_BYTES", 0)
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    actor = RunningActor(network, link=link)
-    for version in range(1, 11):
-        request = learner.receive()[1]
-        learner.publish(version)
-        acknowledge(request, "accepted", version)
-    assert not learner.compact_fetches
-    actor.stop.set()
-    actor.join()
-
-
 def test_actor_plays_with_its_snapshot_if_a_fetch_has_no_answer(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(3)
@@ -156,11 +93,8 @@ def test_actor_plays_with_its_snapshot_if_a_fetch_has_no_answer(network: MemoryN
 class SlowClient(EnvironmentCollector):
     """A collector whose rollouts are complete only after weights of version 1 came."""
 
-    def has_rollout(self) -> bool:
-        return self._policy_version >= 1
-
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None]) -> Rollout | None:  # type: ignore[override] - as Collector has it
-        return super().collect(identity, on_row) if self.has_rollout() else None
+        return super().collect(identity, on_row) if self._policy_version >= 1 else None
 
 
 def test_newer_weights_are_loaded_while_a_rollout_is_incomplete(network: MemoryNetwork) -> None:
@@ -194,7 +128,7 @@ def test_acknowledgement_is_received_while_a_snapshot_is_decoded(
     actor = RunningActor(network)
     learner.publish(0)
     _, request = learner.receive()
-    monkeypatch.setattr(learner_queries, "decode", slow_decode)
+    monkeypatch.setattr(conversation, "decode", slow_decode)
     try:
         learner.publish(1)
         assert decoding.wait(LIMIT)

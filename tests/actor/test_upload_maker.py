@@ -12,7 +12,7 @@ from scripted_learner import POLICY, SPACES, SPEC, Policy, RunningActor, Scripte
 
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session.upload_maker import RolloutUploadMaker, make_upload_maker
+from daedalus.actor.session.uploading import RolloutUploadMaker, make_upload_maker
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed
 from daedalus.learner.serving.upload_checks import restored
@@ -72,7 +72,7 @@ def test_an_actor_that_uploads_rollouts_never_imports_torch() -> None:
 import sys
 sys.modules["torch"] = None  # as if it were not installed
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session.upload_maker import make_upload_maker
+from daedalus.actor.session.uploading import make_upload_maker
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec

@@ -9,8 +9,9 @@ import pytest
 from building import POLICY, RECURRENT, SPACES, identity, make_rollout, make_rollouts, run_spec
 
 from daedalus.algorithms.rollout_gradients import RolloutGradients
-from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.settings_arguments import choose_run, learner_parser
+from daedalus.cli.commands.learner import learner_options, parser
+from daedalus.launch.learner_process import choose_run
+from daedalus.launch.run_choice import with_record
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
@@ -263,8 +264,8 @@ def test_a_resumed_learner_imports_the_algorithm_only_if_allowed(modules: UserMo
     run_directory.create(tmp_path / "run", run_spec(algorithm=f"{MODULE}:Barrier"))
     words = ["--run-dir", str(tmp_path / "run"), "--resume"]
     with pytest.raises(ModuleNotAllowedError, match=f"asks for training.algorithm={MODULE}:Barrier"):
-        choose_run(learner_parser().parse_args(words))
-    chosen = choose_run(learner_parser().parse_args([*words, "--allow-module", MODULE]))
+        choose_run(learner_options(parser().parse_args(words), 0.0, Path()))
+    chosen = choose_run(learner_options(parser().parse_args([*words, "--allow-module", MODULE]), 0.0, Path()))
     assert chosen.spec.algorithm.synchronous
 
 

@@ -5,21 +5,15 @@ from pathlib import Path
 
 from recorded_runs import record
 
-from daedalus.analysis.sweep_plan import PlannedRun, Planner, Point
-from daedalus.cli.commands.sweep import parser, train_words, with_point
-from daedalus.cli.settings_arguments import resolve_spec
+from daedalus.analysis.sweep_plan import PlannedRun, Planner
+from daedalus.cli.commands.sweep import parser
+from daedalus.cli.settings_arguments import run_choice
 from daedalus.learner.run.run_directory import SUMMARY, read_json, write_config
-from daedalus.protocol.spec import RunSpec
 
 
 def planner(folder: Path, *options: str) -> Planner:
     parsed = parser().parse_args(["cartpole", *options])
-
-    def settings(point: Point, seed: int) -> tuple[RunSpec, list[str]]:
-        chosen = with_point(parsed, point, seed)
-        return resolve_spec(chosen), train_words(chosen)
-
-    return Planner(folder, settings)
+    return Planner(run_choice(parsed), parsed.log, folder)
 
 
 def finish(run: PlannedRun, *, evaluation: float = 490.0, solved: bool = False, env_steps: int = 3000) -> None:

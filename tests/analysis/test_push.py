@@ -15,7 +15,7 @@ import pytest
 from hub_server import TOKEN, HubServer, serving
 from recorded_runs import record
 from saved_runs import CARTPOLE, COUNTING, save
-from test_run_report import GIF, HOSTILE, evaluated, happened
+from test_report_command import GIF, HOSTILE, evaluated, happened
 
 import daedalus
 from daedalus.analysis import hub_upload

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from browser import AXE, chromium
 from recorded_runs import record
-from test_run_report import GIF, HOSTILE, evaluated, happened
+from test_report_command import GIF, HOSTILE, evaluated, happened
 
 from daedalus.actor.environments.rendering import FrameRate
 from daedalus.actor.evaluation.video import Video

@@ -6,11 +6,100 @@ from pathlib import Path
 import pytest
 from planning import finish, planner
 
-from daedalus.analysis.sweep_plan import PlannedRun, has_begun, is_done, point_name
+from daedalus.analysis.sweep_plan import (
+    Choices,
+    PlannedRun,
+    Range,
+    has_begun,
+    is_done,
+    point_name,
+    read_axis,
+    split_values,
+)
 from daedalus.cli.commands.train import train_parser
-from daedalus.cli.settings_arguments import resolve_spec
+from daedalus.cli.settings_arguments import run_choice
 from daedalus.learner.run.run_directory import SUMMARY
 from daedalus.learner.run.settings import SettingsError
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("1,5,20", ["1", "5", "20"]),
+        ("[64,64],[32]", ["[64,64]", "[32]"]),
+        ("[[0.0, 1.0], [1.0, 0.5]] , none", ["[[0.0, 1.0], [1.0, 0.5]]", "none"]),
+        ('"a,b",c', ['"a,b"', "c"]),
+        ("{x = 1, y = 2},{}", ["{x = 1, y = 2}", "{}"]),
+        ("tanh", ["tanh"]),
+    ],
+)
+def test_values_end_at_commas_outside_of_brackets(text: str, values: list[str]) -> None:
+    assert split_values(text) == values
+
+
+def test_a_list_of_values() -> None:
+    axis = read_axis("collection.rollout_length = 1,5,20,64")
+    assert axis == Choices(key="collection.rollout_length", values=("1", "5", "20", "64"))
+
+
+@pytest.mark.parametrize(
+    ("text", "low", "high", "whole", "log"),
+    [
+        ("training.learning_rate=1e-4..1e-2", 1e-4, 1e-2, False, True),
+        ("training.discount_factor=0.9..0.999", 0.9, 0.999, False, False),
+        ("collection.rollout_length=4..64", 4, 64, True, True),
+        ("collection.rollout_length=4..40", 4, 40, True, False),
+        ("training.entropy_bonus=0.0..0.1", 0.0, 0.1, False, False),
+        ("training.entropy_bonus=-1..1", -1, 1, True, False),
+    ],
+)
+def test_a_range_is_logarithmic_beyond_a_factor_of_10(
+    text: str, low: float, high: float, whole: bool, log: bool
+) -> None:
+    axis = read_axis(text)
+    assert axis == Range(key=text.partition("=")[0], low=low, high=high, whole=whole)
+    assert isinstance(axis, Range)
+    assert axis.log is log
+
+
+def test_a_value_of_a_range_is_short_and_inside() -> None:
+    axis = Range(key="a.b", low=0.00123456, high=0.0987654, whole=False)
+    assert axis.written(0.0034567891) == "0.003457"
+    assert axis.written(0.09876539) == "0.0987654"  # rounded, it would be beyond the end
+    assert Range(key="a.b", low=4, high=64, whole=True).written(5) == "5"
+    assert Range(key="a.b", low=1e6, high=1e6 + 1, whole=False).written(1_000_000.25) == "1000000.25"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rollout_length=1,2", "write section.key=value,value"),
+        ("collection.rollout_length", "write section.key=value,value"),
+        ("collection.rollout_length=", "write section.key=value,value"),
+        ("colection.rollout_length=1,2", "there is no section 'colection'"),
+        ("collection.rollout_length=1,,2", "a value is empty"),
+        ("collection.rollout_length=5,20,5", "the value 5 is there twice"),
+        ("training.learning_rate=1e-3,0.001", r"the value 0\.001 is there twice"),
+        ("training.learning_rate=1e-2..1e-4", "the range is empty: write the lower end first"),
+        ("training.learning_rate=1..1e999", "an end of the range is too large"),
+        ("environment.kwargs.x=False,false", "the value false is there twice"),
+        ("environment.kwargs.x=FALSE,true", "FALSE would be a text: write false"),
+        ("environment.kwargs.x=08,9", "08 would be a text: write 8"),
+        ("training.seed=1,2", "use --seeds N"),
+        ("environment.id=A-v0,B-v0", "a sweep has one environment"),
+    ],
+)
+def test_bad_input_is_one_line(text: str, message: str) -> None:
+    with pytest.raises(SettingsError, match=message) as error:
+        read_axis(text)
+    assert "\n" not in str(error.value)
+
+
+def test_underscores_are_for_numbers_between_digits_only() -> None:
+    assert read_axis("training.batch_rollouts=1_0..2_0") == Range(
+        key="training.batch_rollouts", low=10.0, high=20.0, whole=True
+    )
+    assert read_axis("training.batch_rollouts=1_..2") == Choices(key="training.batch_rollouts", values=("1_..2",))
 
 
 def as_trained(run: PlannedRun) -> argparse.Namespace:
@@ -28,7 +117,7 @@ def test_the_command_line_of_a_run_gives_the_settings_that_are_planned(tmp_path:
     parsed = as_trained(second)
     assert parsed.run_dir == second.directory
     assert parsed.log == ["wandb", "mlflow"]
-    assert resolve_spec(parsed) == second.spec
+    assert run_choice(parsed).spec() == second.spec
     assert second.spec.training.seed == 4
     assert second.spec.training.env_steps == 5000
     assert second.spec.policy.hidden == (32,)
@@ -38,7 +127,7 @@ def test_the_command_line_of_a_run_gives_the_settings_that_are_planned(tmp_path:
 def test_an_algorithm_brings_the_settings_of_its_preset(tmp_path: Path) -> None:
     (run,) = planner(tmp_path).runs("a3c", {"training.algorithm": "a3c"}, [1])
     assert run.spec.collection.rollout_length == 16  # of the preset's for_algorithm table
-    assert resolve_spec(as_trained(run)) == run.spec
+    assert run_choice(as_trained(run)).spec() == run.spec
 
 
 def test_settings_that_are_not_valid_are_refused_before_any_run(tmp_path: Path) -> None:

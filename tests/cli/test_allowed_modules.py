@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli.commands import actor_arguments, train
-from daedalus.cli.running import child_arguments
-from daedalus.cli.running.local_run import LocalRun
-from daedalus.cli.settings_arguments import choose_run, learner_parser, resolve
+from daedalus.cli.commands import actor, train
+from daedalus.cli.commands.learner import learner_options, parser
+from daedalus.cli.settings_arguments import run_choice
+from daedalus.launch import local_run
+from daedalus.launch.learner_process import choose_run
+from daedalus.launch.local_run import LocalRun
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_settings
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
@@ -57,7 +59,7 @@ def test_resume_in_another_folder_than_that_of_the_module_changes_nothing(
 
 def test_a_learner_takes_the_word_of_its_command_line_but_not_of_the_run_directory(run: Path) -> None:
     def chosen(*words: str) -> frozenset[str]:
-        return choose_run(learner_parser().parse_args(words)).modules.allowed
+        return choose_run(learner_options(parser().parse_args(words), 0.0, Path())).modules.allowed
 
     resumed = ("--run-dir", str(run), "--resume")
     settings = ("--wrap", "wrappers:step_costs", "--set", "policy.encoder=nets:Net")
@@ -72,20 +74,20 @@ def test_a_learner_takes_the_word_of_its_command_line_but_not_of_the_run_directo
 
 def test_train_passes_the_modules_of_its_settings_on(tmp_path: Path) -> None:
     words = ["--env", "corridor:Corridor-v0", "--wrap", "wrappers:step_costs", "--set", "policy.encoder=nets:Net"]
-    spec, _ = resolve(train.train_parser().parse_args(words))
+    spec = run_choice(train.train_parser().parse_args(words)).spec()
     assert (spec.environment, spec.policy.encoder) == (SPEC.environment, SPEC.policy.encoder)
     run_directory.write_config(tmp_path, spec)
     assert run_directory.read_config(tmp_path).environment.wrap == "wrappers:step_costs"
-    options = child_arguments.actor_arguments(LocalRun(directory=tmp_path, spec=spec, started=0.0))
+    options = local_run.actor_arguments(LocalRun(directory=tmp_path, spec=spec, started=0.0))
     assert options[-4:] == ("--allow-module", "corridor", "--allow-module", "wrappers")
 
 
 def test_an_actor_allows_only_what_its_command_line_names(capsys: pytest.CaptureFixture[str]) -> None:
-    parse = actor_arguments.parser().parse_args
+    parse = actor.parser().parse_args
     connect = ["--connect", "tcp/127.0.0.1:1"]
-    assert actor_arguments.config(parse(connect), None).modules.allowed == frozenset()
+    assert actor.actor_options(parse(connect)).config(None).modules.allowed == frozenset()
     allowing = [*connect, "--allow-module", "corridor", "--allow-module", "my.wrappers"]
-    modules = actor_arguments.config(parse(allowing), None).modules
+    modules = actor.actor_options(parse(allowing)).config(None).modules
     assert (modules.allowed, modules.source) == ({"corridor", "my.wrappers"}, "the learner")
     for wrong in ("corridor:Corridor-v0", "corridor.", "../corridor", "corridor.py"):
         with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""cli/callbacks.py and learner/reporting/user_metrics.py: rows to a callback, and its metrics to the learner."""
+"""launch/callbacks.py and learner/reporting/user_metrics.py: rows to a callback, and its metrics to the learner."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from daedalus.cli.callbacks import Callback, CallbackObserver, TrainingRun, observed
+from daedalus.launch.callbacks import Callback, CallbackObserver, TrainingRun, observed
 from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.user_metrics import MOST_METRICS, RowsWriter, UserMetrics
 

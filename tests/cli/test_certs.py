@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli import certificate_authority, certificate_folder
 from daedalus.cli.commands.certs import certs
+from daedalus.launch import certificates
 from daedalus.transport.credentials import authorised_names, load
 
 
@@ -56,7 +56,7 @@ def test_issue_that_was_interrupted_succeeds_when_it_is_repeated(
 ) -> None:
     folder = make(tmp_path / "certs")
     with monkeypatch.context() as broken:
-        broken.setattr(certificate_authority, "_pem", _disk_full)
+        broken.setattr(certificates, "_pem", _disk_full)
         assert certs(["issue", "actor", "arm-1", "--directory", str(folder)]) == 1
     assert (folder / "ca" / "actor-arm-1").exists()
     assert certs(["issue", "actor", "arm-1", "--directory", str(folder)]) == 0, capsys.readouterr().err
@@ -139,7 +139,7 @@ def test_more_certificates_than_a_handshake_has_room_for_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = make(tmp_path / "certs")
-    monkeypatch.setattr(certificate_folder, "_MAX_SUBJECT_BYTES", 60)
+    monkeypatch.setattr(certificates, "_MAX_SUBJECT_BYTES", 60)
     assert certs(["issue", "actor", "arm", "--directory", str(made)]) == 0
     assert certs(["issue", "actor", "box", "--directory", str(made)]) == 1
     assert not (made / "actor-box").exists()

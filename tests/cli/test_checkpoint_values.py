@@ -7,7 +7,7 @@ import pytest
 import torch
 from saved_runs import CARTPOLE, save
 
-from daedalus.cli.checkpoint_values import CheckpointValues
+from daedalus.launch.camera_process import CheckpointValues
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.user_modules import NO_MODULES

@@ -1,4 +1,4 @@
-"""Test of cli/child_output.py: the output of child processes goes to a log and, within a limit, to the screen."""
+"""Test of launch/child_output.py: the output of child processes goes to a log and, within a limit, to the screen."""
 
 import os
 import signal
@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from processes import LIMIT, until
 
-from daedalus.cli import child_output
-from daedalus.cli.child_output import STREAMS, ChildOutput, OutputLog, RateLimit
+from daedalus.launch import child_output
+from daedalus.launch.child_output import STREAMS, ChildOutput, OutputLog, RateLimit
 
 
 class Screen:

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from processes import until
 
-from daedalus.analysis.statistics import mean_interval
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.commands.evaluate_arguments import parser
-from daedalus.cli.running import confirmation as module
-from daedalus.cli.running.confirmation import Confirmations, confirmation, confirmation_arguments
+from daedalus.cli.commands.evaluate import parser
+from daedalus.launch import confirmation as module
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.confirmation import Confirmations, confirmation, confirmation_arguments, mean_interval
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.target_confirmation import TargetConfirmation

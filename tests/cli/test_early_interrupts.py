@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli.child_output import Streams
-from daedalus.cli.supervisor import start
+from daedalus.launch.child_output import Streams
+from daedalus.launch.supervision import start
 
 SECONDS = 60.0  # generous for slow machines
 # In place of a command: it imports until the test writes a line, then it has handlers.
@@ -17,7 +17,7 @@ WAITING = """
 import sys
 print("importing", flush=True)
 sys.stdin.readline()
-from daedalus.cli.processes import stop_on_signals
+from daedalus.launch.process_lifecycle import stop_on_signals
 print("stopped" if stop_on_signals().wait(60.0) else "not stopped", flush=True)
 """
 PROGRAM = """

@@ -1,4 +1,4 @@
-"""cli/evaluation_processes.py: an evaluation whose process ends without a result."""
+"""launch/final_evaluation.py: an evaluation whose process ends without a result."""
 
 import subprocess
 import sys
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli import evaluation_processes
-from daedalus.cli.child_output import ChildOutput, Streams
-from daedalus.cli.evaluation_processes import EvaluationFailedError, play
+from daedalus.launch import final_evaluation
+from daedalus.launch.child_output import ChildOutput, Streams
+from daedalus.launch.final_evaluation import EvaluationFailedError, play
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def test_a_process_that_ends_without_a_result_is_named(
         command = [sys.executable, "-S", "-c", program]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=streams.stdout, stderr=streams.stderr)
 
-    monkeypatch.setattr(evaluation_processes, "start", start)
+    monkeypatch.setattr(final_evaluation, "start", start)
     output = ChildOutput(tmp_path / "output.log", print, print)
     with pytest.raises(EvaluationFailedError, match=reason):
         play([["RUN_DIR"]], threading.Event(), output)

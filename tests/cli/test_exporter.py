@@ -12,8 +12,9 @@ from processes import LIMIT, until
 from prometheus_client import CollectorRegistry
 from statuses import run_status
 
-from daedalus.cli import metrics_server
-from daedalus.cli.commands.exporter import StatusCollector, exporter
+from daedalus.cli.commands.exporter import exporter
+from daedalus.launch import prometheus_exporter
+from daedalus.launch.prometheus_exporter import StatusCollector
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import StatusReport
@@ -77,6 +78,7 @@ def test_a_missing_package_is_reported_with_the_extra_that_installs_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    monkeypatch.delitem(sys.modules, "daedalus.launch.prometheus_exporter")
     assert exporter(["--connect", UNUSED]) == 1
     message = capsys.readouterr().err
     assert 'pip install "daedalus-rl[monitoring]"' in message
@@ -100,9 +102,9 @@ def test_an_address_in_use_is_reported(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_silent_connections_keep_no_threads_and_nobody_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_server, "_MAX_CONNECTIONS", 3)
-    monkeypatch.setattr(metrics_server._Handler, "timeout", None)  # nothing but the limit ends a silent connection
-    server = metrics_server.MetricsServer("127.0.0.1", 0, CollectorRegistry())
+    monkeypatch.setattr(prometheus_exporter, "_MAX_CONNECTIONS", 3)
+    monkeypatch.setattr(prometheus_exporter._Handler, "timeout", None)  # nothing but the limit ends a silent connection
+    server = prometheus_exporter.MetricsServer("127.0.0.1", 0, CollectorRegistry())
     thread = threading.Thread(target=server.serve_forever)
     before = set(threading.enumerate())
     thread.start()
@@ -127,7 +129,7 @@ def test_silent_connections_keep_no_threads_and_nobody_out(monkeypatch: pytest.M
 def test_silent_connections_end_before_one_that_has_asked(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(metrics_server, "_MAX_CONNECTIONS", 3)
+    monkeypatch.setattr(prometheus_exporter, "_MAX_CONNECTIONS", 3)
     asked, answer = threading.Event(), threading.Event()
 
     class SlowCollector:
@@ -137,7 +139,7 @@ def test_silent_connections_end_before_one_that_has_asked(
             return []
 
     registry = CollectorRegistry()
-    server = metrics_server.MetricsServer("127.0.0.1", 0, registry)
+    server = prometheus_exporter.MetricsServer("127.0.0.1", 0, registry)
     registry.register(SlowCollector())
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
@@ -161,8 +163,8 @@ def test_silent_connections_end_before_one_that_has_asked(
 
 
 def test_a_connection_that_says_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_server._Handler, "timeout", 0.1)
-    server = metrics_server.MetricsServer("127.0.0.1", 0, CollectorRegistry())
+    monkeypatch.setattr(prometheus_exporter._Handler, "timeout", 0.1)
+    server = prometheus_exporter.MetricsServer("127.0.0.1", 0, CollectorRegistry())
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     with socket.create_connection(("127.0.0.1", server.server_port), LIMIT) as silent:

@@ -6,7 +6,7 @@ from building import run_spec
 from certificates import unchecked
 
 from daedalus.cli.commands.certs import certs
-from daedalus.cli.learner_network import how_to_join
+from daedalus.launch.learner_process import how_to_join
 
 
 def test_the_command_names_an_address_of_the_certificate(tmp_path: Path) -> None:

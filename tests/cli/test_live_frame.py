@@ -1,4 +1,4 @@
-"""cli/watching: the curve, the rates and the frame of a run."""
+"""cli/live_frame.py: the curve, the rates and the frame of a run."""
 
 import io
 
@@ -7,9 +7,8 @@ import pytest
 from rich.console import Console
 from statuses import actor_status, run_status
 
-from daedalus.cli.watching.frame import frame, summary_frame
-from daedalus.cli.watching.sparkline import ASCII, sparkline
-from daedalus.cli.watching.watched_run import WatchedRun
+from daedalus.cli.live_frame import ASCII, frame, sparkline, summary_frame
+from daedalus.cli.run_watcher import WatchedRun
 from daedalus.protocol.messages import MetricsPage, MetricsReport, RunStatus
 
 

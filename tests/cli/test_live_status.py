@@ -1,4 +1,4 @@
-"""cli/watching: a live display queries the learner again and again, and outlasts its restarts."""
+"""cli/run_watcher.py: a live display queries the learner again and again, and outlasts its restarts."""
 
 import io
 import json
@@ -13,12 +13,11 @@ from processes import LIMIT, until
 from statuses import actor_status, run_status
 from terminal import Terminal
 
+from daedalus.cli import screen
 from daedalus.cli.commands import status as status_module
 from daedalus.cli.commands.status import status as status_command
-from daedalus.cli.watching import status_watch, training_display
-from daedalus.cli.watching.run_watcher import looks
-from daedalus.cli.watching.screen import Screen
-from daedalus.cli.watching.training_display import TrainingDisplay
+from daedalus.cli.run_watcher import looks
+from daedalus.cli.screen import Screen, TrainingDisplay
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
@@ -64,8 +63,8 @@ class Tty(io.StringIO):
 def tty(monkeypatch: pytest.MonkeyPatch) -> Tty:
     for name, value in {"COLUMNS": "100", "LINES": "20", "TERM": "xterm"}.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(training_display, "_LOOK_SECONDS", 0.01)
-    monkeypatch.setattr(training_display, "_FIRST_SECONDS", 0.0)
+    monkeypatch.setattr(screen, "_LOOK_SECONDS", 0.01)
+    monkeypatch.setattr(screen, "_FIRST_SECONDS", 0.0)
     return Tty()
 
 
@@ -117,7 +116,7 @@ def test_status_watch_redraws_a_frame_until_ctrl_c(tty: Tty, monkeypatch: pytest
             if len(frames) == 3:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(status_watch, "_FRAME_SECONDS", 0.0)
+    monkeypatch.setattr(status_module, "_FRAME_SECONDS", 0.0)
     monkeypatch.setattr(status_module, "connect_until_interrupted", learner.connect)
     monkeypatch.setattr(status_module, "Screen", lambda: Interrupted(tty, tty))
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch"]) == 0
@@ -148,7 +147,7 @@ def test_status_watch_prints_lines_elsewhere(
     name = "_json" if options else "_text"
     original: Callable[[RunStatus], str] = getattr(status_module, name)
     monkeypatch.setattr(status_module, name, interrupted)
-    monkeypatch.setattr(status_watch, "_TEXT_SECONDS", 0.0)
+    monkeypatch.setattr(status_module, "_TEXT_SECONDS", 0.0)
     monkeypatch.setattr(status_module, "connect_until_interrupted", connect)
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch", *options]) == 0
     printed = capsys.readouterr()
@@ -195,7 +194,7 @@ def test_a_fault_of_the_display_does_not_disturb_training(
 ) -> None:
     learner = Learner()
     monkeypatch.setattr("daedalus.transport.connecting.connect", learner.connect)
-    monkeypatch.setattr("daedalus.cli.watching.frame._head", lambda *_: 1 / 0)
+    monkeypatch.setattr("daedalus.cli.live_frame._head", lambda *_: 1 / 0)
     display.begin("unixsock-stream//nowhere")
     display.poll(None)  # type: ignore[arg-type]
     assert display._thread is not None

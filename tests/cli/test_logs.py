@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from daedalus.cli.logs import EVENTS, configure_logging, print_error
+from daedalus.launch.logs import EVENTS, configure_logging, print_error
 
 LOGGER = logging.getLogger("daedalus.test")
 TIME = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"

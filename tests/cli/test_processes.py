@@ -1,4 +1,4 @@
-"""cli/processes.py: limits and the end of a process."""
+"""launch/process_lifecycle.py: limits and the end of a process."""
 
 import resource
 import subprocess
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from processes import LIMIT
 
-from daedalus.cli.processes import exit_status, raise_descriptor_limit
+from daedalus.launch.process_lifecycle import exit_status, raise_descriptor_limit
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_a_child_process_that_asks_a_question_gets_no_answer() -> None:
     """Nobody could answer; the end of the parent is noticed as before."""
     program = (
         "import threading\n"
-        "from daedalus.cli.processes import exit_with_parent\n"
+        "from daedalus.launch.process_lifecycle import exit_with_parent\n"
         "stop = threading.Event()\n"
         "exit_with_parent(stop)\n"
         "try: input()\n"
@@ -78,7 +78,7 @@ def test_a_thread_of_an_environment_does_not_hold_up_the_end(tmp_path: Path) -> 
     )
     done = ended(
         "import sys\n"
-        "from daedalus.cli.processes import exit_status\n"
+        "from daedalus.launch.process_lifecycle import exit_status\n"
         "def command():\n"
         "    import simulator\n"
         "    simulator.connect()\n"
@@ -94,7 +94,7 @@ def test_an_exception_in_a_thread_of_an_environment_ends_only_the_thread(tmp_pat
     (tmp_path / "simulator.py").write_text("def listen(): raise TimeoutError('the link is lost')\n")
     done = ended(
         "import threading, simulator\n"
-        "from daedalus.cli.processes import exit_on_thread_exceptions\n"
+        "from daedalus.launch.process_lifecycle import exit_on_thread_exceptions\n"
         "exit_on_thread_exceptions(plays=True)\n"
         "thread = threading.Thread(target=simulator.listen)\n"
         "thread.start()\n"
@@ -110,7 +110,7 @@ def test_a_fork_of_an_environment_ends_at_a_signal(tmp_path: Path) -> None:
     """The interpreter would wait for ever for a process that ignores SIGTERM."""
     done = ended(
         "import os, signal, time\n"
-        "from daedalus.cli.processes import stop_on_signals\n"
+        "from daedalus.launch.process_lifecycle import stop_on_signals\n"
         "stop_on_signals()\n"
         "begun, begins = os.pipe()\n"
         "child = os.fork()\n"

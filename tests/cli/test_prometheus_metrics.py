@@ -1,4 +1,4 @@
-"""Test of cli/prometheus_metrics.py."""
+"""Test of launch/prometheus_exporter.py."""
 
 from collections.abc import Iterable
 
@@ -8,7 +8,7 @@ from prometheus_client.core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from statuses import actor_status, run_status
 
-from daedalus.cli.prometheus_metrics import metrics
+from daedalus.launch.prometheus_exporter import metrics
 from daedalus.protocol.messages import RunStatus
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]

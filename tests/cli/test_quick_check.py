@@ -1,4 +1,4 @@
-"""cli/quick_check.py: the check in a process of its own, and what a run takes from it."""
+"""launch/environment_check.py: the check in a process of its own, and what a run takes from it."""
 
 import os
 import subprocess
@@ -12,10 +12,11 @@ from log_lines import LINES
 from plain import array_space, vector_spaces
 from processes import LIMIT, until
 
-from daedalus.cli import check_process
-from daedalus.cli import quick_check as module
-from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck
-from daedalus.cli.quick_check import (
+from daedalus.launch import environment_check
+from daedalus.launch import environment_check as module
+from daedalus.launch.environment_check import (
+    CheckTimeoutError,
+    EnvironmentCheck,
     EnvironmentProblemError,
     checked_defaults,
     checked_spaces,
@@ -88,8 +89,8 @@ def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         started.append(spawn(check, writing))
         return started[0]
 
-    spawn = check_process._spawned
-    monkeypatch.setattr(check_process, "_spawned", spawned)
+    spawn = environment_check._spawned
+    monkeypatch.setattr(environment_check, "_spawned", spawned)
     monkeypatch.setattr(module, "_MOST_SECONDS", 10 * LIMIT)
     stop, ended = threading.Event(), threading.Event()
     stop.set()
@@ -122,7 +123,7 @@ def test_a_check_that_is_not_done_in_time_ends_the_programs_that_its_environment
     file = tmp_path / "pid"
     program = (
         "import sys\n"
-        "from daedalus.cli import quick_check as module\n"
+        "from daedalus.launch import environment_check as module\n"
         "from daedalus.policy.user_modules import UserModules\n"
         "from daedalus.protocol.spec import EnvironmentSpec\n"
         "module._MOST_SECONDS = 1000.0\n"
@@ -151,7 +152,7 @@ def _has_ended(pid: int) -> bool:
 def test_a_fork_gives_the_same_report_and_leaves_the_module_out_of_the_parent() -> None:
     program = (
         f"import sys; sys.path += {[str(TESTS), str(TESTS / 'cli')]}; "
-        "from test_quick_check import MODULES, faulty; from daedalus.cli.quick_check import quick_check; "
+        "from test_quick_check import MODULES, faulty; from daedalus.launch.environment_check import quick_check; "
         "print(quick_check(faulty('shape'), MODULES, fork=True).problems); print('faulty_environments' in sys.modules)"
     )
     result = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""cli/run_report.py: the last lines of `daedalus train`."""
+"""cli/commands/train.py: the last lines of `daedalus train`."""
 
 import importlib.util
 import time
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli.run_report import report
-from daedalus.cli.running.local_run import LocalRun
+from daedalus.cli.commands.train import report
+from daedalus.launch.local_run import LocalRun
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 SUMMARY = {

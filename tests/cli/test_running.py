@@ -1,4 +1,4 @@
-"""Test of cli/running: that no process of a run outlives it, and which episodes are played at its end."""
+"""launch/local_training.py: that no process of a run outlives it, and which episodes are played at its end."""
 
 import subprocess
 import sys
@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands import train as train_command
-from daedalus.cli.running import final_evaluation, new_run, training
-from daedalus.cli.running import run_locally as run_locally_module
-from daedalus.cli.running.local_run import LocalRun, RunFailedError
-from daedalus.cli.running.run_locally import run_locally
-from daedalus.cli.supervisor import Supervised
-from daedalus.cli.tracking.tracker_processes import TrackerProcesses
+from daedalus.launch import final_evaluation, local_training, run_choice
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.local_run import LocalRun, RunFailedError
+from daedalus.launch.local_training import run_locally
+from daedalus.launch.logs import LogOptions
+from daedalus.launch.supervision import Supervised
+from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.protocol.spec import RunSpec
 
 
@@ -33,8 +33,8 @@ def test_actor_that_cannot_be_started_ends_the_learner_and_the_actors_before_it(
     def supervised(*_: Any) -> Supervised:
         return Supervised("process", begin, ended={0})
 
-    monkeypatch.setattr(training, "_supervised_learner", supervised)
-    monkeypatch.setattr(training, "supervised_actor", supervised)
+    monkeypatch.setattr(local_training, "_supervised_learner", supervised)
+    monkeypatch.setattr(local_training, "supervised_actor", supervised)
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "collection": {"actors": 4}})
     output = ChildOutput(tmp_path / "output.log", print, print)
     try:
@@ -53,7 +53,7 @@ def test_trackers_have_little_time_after_an_interrupt(tmp_path: Path, monkeypatc
     def interrupted(*_: Any) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_locally_module, "train", interrupted)
+    monkeypatch.setattr(local_training, "train", interrupted)
     monkeypatch.setattr(TrackerProcesses, "finish", lambda _, stop: seen.append(stop.is_set()))
     run = LocalRun(directory=tmp_path, spec=RunSpec.model_validate({"environment": {"id": "X-v0"}}), started=0.0)
     with pytest.raises(KeyboardInterrupt):
@@ -72,8 +72,8 @@ def test_a_run_that_failed_after_a_checkpoint_says_how_to_continue_it(
         raise RunFailedError(reason)
 
     monkeypatch.setattr(train_command, "run_locally", fail)
-    monkeypatch.setattr(new_run, "checked_spaces", lambda *_, **_others: None)
-    monkeypatch.setattr(train_command, "configure_logging", lambda *_, **_others: None)
+    monkeypatch.setattr(run_choice, "checked_spaces", lambda *_, **_others: None)
+    monkeypatch.setattr(LogOptions, "configure", lambda *_, **_others: None)
     monkeypatch.setattr(train_command, "stop_on_signals", lambda **_: threading.Event())
     monkeypatch.setattr(train_command.signal, "signal", lambda *_: None)
     assert train_command.train(["cartpole", "--run-dir", str(directory)]) == 1

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from daedalus.cli.running.sampled_evaluation import is_below_training, sampled_note
+from daedalus.launch.final_evaluation import is_below_training, sampled_note
 
 
 def result(mean: float, std: float, actions: str = "greedy", episodes: int = 100) -> dict[str, Any]:

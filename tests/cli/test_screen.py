@@ -1,4 +1,4 @@
-"""cli/watching/screen.py: lines of several threads and a frame share a terminal."""
+"""cli/screen.py: lines of several threads and a frame share a terminal."""
 
 import importlib.util
 import io
@@ -9,8 +9,8 @@ import pytest
 from statuses import actor_status, run_status
 from terminal import Terminal
 
-from daedalus.cli.watching.screen import Screen
-from daedalus.cli.watching.watched_run import WatchedRun
+from daedalus.cli.run_watcher import WatchedRun
+from daedalus.cli.screen import Screen
 
 
 class Tty(io.StringIO):

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from saved_runs import CARTPOLE, save, score
 
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.commands.evaluate_arguments import parser
-from daedalus.cli.running import select_best as module
-from daedalus.cli.running.select_best import select_best
+from daedalus.cli.commands.evaluate import parser
+from daedalus.launch import final_evaluation as module
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.final_evaluation import select_best
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 
 

@@ -4,10 +4,22 @@ from pathlib import Path
 
 import pytest
 
+from daedalus.cli.commands.learner import learner_options, parser
 from daedalus.cli.commands.train import resume_parser, train_parser
-from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
+from daedalus.cli.settings_arguments import run_choice
+from daedalus.launch.learner_process import ChosenRun, choose_run
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
+from daedalus.protocol.spec import RunSpec
+
+
+def spec_of(*words: str) -> RunSpec:
+    return run_choice(parser().parse_args(words)).spec()
+
+
+def chosen(*words: str) -> ChosenRun:
+    return choose_run(learner_options(parser().parse_args(words), 0.0, Path()))
+
 
 RATES = {"impala": 0.25, "appo": 0.5, "a3c": 0.125}
 
@@ -15,29 +27,29 @@ RATES = {"impala": 0.25, "appo": 0.5, "a3c": 0.125}
 def test_two_environments_are_refused() -> None:
     words = ["--env", "CartPole-v1", "--set", "environment.id=Acrobot-v1"]
     with pytest.raises(SettingsError, match=r"--env CartPole-v1 and environment.id=Acrobot-v1 are two environments"):
-        resolve(learner_parser().parse_args(words))
-    spec, _ = resolve(learner_parser().parse_args([*words[:3], "environment.id=CartPole-v1"]))
+        spec_of(*words)
+    spec = spec_of(*[*words[:3], "environment.id=CartPole-v1"])
     assert spec.environment.id == "CartPole-v1"
 
 
 def test_a_preset_and_an_environment_are_refused() -> None:
     with pytest.raises(SettingsError, match=r"^leave out one of cartpole and --env CartPole-v1$"):
-        resolve(learner_parser().parse_args(["cartpole", "--env", "CartPole-v1"]))
+        spec_of("cartpole", "--env", "CartPole-v1")
     with pytest.raises(SettingsError, match=r"^name a preset \(acrobot, .*\) or an environment with --env ID$"):
-        resolve(learner_parser().parse_args([]))
+        spec_of()
 
 
 @pytest.mark.parametrize("text", ["", "[training]\nenv_steps = 3\n", "[environment]\nbackend = 'fast'"])
 def test_a_file_without_an_environment_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "own.toml").write_text(text)
     with pytest.raises(SettingsError, match=r"^setting environment(\.id)? is missing: add it$"):
-        resolve(learner_parser().parse_args([str(tmp_path / "own.toml")]))
+        spec_of(str(tmp_path / "own.toml"))
 
 
 @pytest.mark.parametrize(("text", "number"), [("1e6", 1_000_000), ("1_000_000", 1_000_000), ("25", 25), ("2.5e1", 25)])
 def test_env_steps_may_be_written_as_any_whole_number(text: str, number: int) -> None:
-    for parser, words in ((learner_parser, []), (train_parser, []), (resume_parser, ["run"])):
-        assert parser().parse_args([*words, "--env-steps", text]).env_steps == number
+    for make, words in ((parser, []), (train_parser, []), (resume_parser, ["run"])):
+        assert make().parse_args([*words, "--env-steps", text]).env_steps == number
 
 
 @pytest.mark.parametrize("text", ["1.5", "1e-1", "inf", "nan", "many", ""])
@@ -52,19 +64,19 @@ def test_a_repeated_config_is_named_after_its_environment(
     tmp_path_factory: pytest.TempPathFactory, name: str, named: str
 ) -> None:
     folder = tmp_path_factory.mktemp("run")
-    spec, _ = resolve(learner_parser().parse_args(["--env", "Acrobot-v1", "--seed", "5"]))
+    spec = spec_of("--env", "Acrobot-v1", "--seed", "5")
     run_directory.write_config(folder, spec)
     (folder / run_directory.CONFIG).rename(folder / name)
-    again, directory = resolve(learner_parser().parse_args([str(folder / name)]))
-    assert again == spec
-    assert directory.name.startswith(f"{named}-appo-s5-")
+    choice = run_choice(parser().parse_args([str(folder / name)]))
+    assert choice.spec() == spec
+    assert choice.directory(spec).name.startswith(f"{named}-appo-s5-")
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "n_step_q"])
 def test_an_algorithm_that_set_chooses_brings_the_settings_of_its_preset(algorithm: str) -> None:
     words = ["cartpole", "--seed", "3", "--set", "collection.rollout_length=7"]
-    chosen, _ = resolve(learner_parser().parse_args([*words, "--algorithm", algorithm]))
-    also, _ = resolve(learner_parser().parse_args([*words, "--set", f"training.algorithm={algorithm}"]))
+    chosen = spec_of(*words, "--algorithm", algorithm)
+    also = spec_of(*words, "--set", f"training.algorithm={algorithm}")
     assert also == chosen
     assert also.training.algorithm == algorithm
     assert also.collection.rollout_length == 7
@@ -73,32 +85,32 @@ def test_an_algorithm_that_set_chooses_brings_the_settings_of_its_preset(algorit
 def test_a_file_without_an_algorithm_has_the_settings_for_the_default_one(tmp_path: Path) -> None:
     tables = "".join(f"[for_algorithm.{name}.training]\nlearning_rate = {rate}\n" for name, rate in RATES.items())
     (tmp_path / "own.toml").write_text("[environment]\nid = 'CartPole-v1'\n" + tables)
-    spec, _ = resolve(learner_parser().parse_args([str(tmp_path / "own.toml")]))
+    spec = spec_of(str(tmp_path / "own.toml"))
     assert spec.training.learning_rate == RATES[spec.training.algorithm]
 
 
 def test_an_algorithm_that_is_no_text_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text("[environment]\nid = 'CartPole-v1'\n[training]\nalgorithm = ['a2c']\n")
     with pytest.raises(SettingsError, match=r"^setting training.algorithm should be a valid string, not \['a2c'\]"):
-        resolve(learner_parser().parse_args([str(tmp_path / "own.toml")]))
+        spec_of(str(tmp_path / "own.toml"))
 
 
 def test_default_settings_of_a_policy_with_memory_have_fewer_updates_unless_they_are_chosen() -> None:
     words = ["--env", "CartPole-v1", "--set", "policy.memory=gru"]
-    spec, _ = resolve(learner_parser().parse_args(words))
+    spec = spec_of(*words)
     assert (spec.training.passes, spec.training.minibatches, spec.collection.rollout_length) == (4, 4, 32)
-    spec, _ = resolve(learner_parser().parse_args([*words, "--set", "training.passes=2"]))
+    spec = spec_of(*words, "--set", "training.passes=2")
     assert (spec.training.passes, spec.training.minibatches) == (2, 4)
-    spec, _ = resolve(learner_parser().parse_args(words[:2]))
+    spec = spec_of(*(words[:2]))
     assert (spec.training.passes, spec.collection.rollout_length) == (10, 128)
 
 
 def test_a_learner_that_resumes_changes_the_settings_that_its_command_line_names(tmp_path: Path) -> None:
-    spec, _ = resolve(learner_parser().parse_args(["cartpole", "--set", "training.learning_rate=0.5"]))
+    spec = spec_of("cartpole", "--set", "training.learning_rate=0.5")
     run_directory.create(tmp_path / "run", spec)
 
     def resumed(*words: str) -> ChosenRun:
-        return choose_run(learner_parser().parse_args([*words, "--run-dir", str(tmp_path / "run"), "--resume"]))
+        return chosen(*words, "--run-dir", str(tmp_path / "run"), "--resume")
 
     same = ("cartpole", "--set", "training.learning_rate=0.5")
     for words in ((), same, ("--env", "CartPole-v1")):
@@ -107,7 +119,7 @@ def test_a_learner_that_resumes_changes_the_settings_that_its_command_line_names
         assert longer.spec.training == spec.training.model_copy(update={"env_steps": 9_000_000})
         assert longer.changed == ["training.env_steps"]
     with pytest.raises(SettingsError, match="--reset-statistics needs --resume"):
-        choose_run(learner_parser().parse_args(["cartpole", "--reset-statistics"]))
+        chosen("cartpole", "--reset-statistics")
     for words, names in (
         (("--seed", "9"), "training.seed"),
         (("cartpole", "--algorithm", "a2c", "--set", "policy.hidden=[3]"), "policy.hidden, training.algorithm.*"),

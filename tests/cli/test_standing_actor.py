@@ -9,7 +9,9 @@ from log_lines import LINES
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError, NoLearnerError
-from daedalus.cli.commands import actor
+from daedalus.cli.commands import actor as command
+from daedalus.launch import actor_process
+from daedalus.launch.logs import LogOptions
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.transport.credentials import CredentialsError, NotValidNowError
 from daedalus.transport.interface import RefusedError, TransportError, UnreachableError
@@ -41,10 +43,10 @@ def script(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
             raise result
         return result
 
-    monkeypatch.setattr(actor, "stop_on_signals", lambda **_: stop)
-    monkeypatch.setattr(actor, "configure_logging", lambda *_, **__: None)
-    monkeypatch.setattr(actor, "_serve_run", serve)
-    monkeypatch.setattr(actor, "_NEXT_RUN_SECONDS", 0.0)
+    monkeypatch.setattr(command, "stop_on_signals", lambda **_: stop)
+    monkeypatch.setattr(LogOptions, "configure", lambda *_, **__: None)
+    monkeypatch.setattr(actor_process, "_serve_run", serve)
+    monkeypatch.setattr(actor_process, "_NEXT_RUN_SECONDS", 0.0)
     monkeypatch.setattr("daedalus.transport.retries._MAX_PAUSE_SECONDS", 0.001)
     monkeypatch.setattr("daedalus.transport.retries._FIRST_PAUSE_SECONDS", 0.001)
     return left
@@ -52,7 +54,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def run(monkeypatch: pytest.MonkeyPatch, *options: str) -> int:
     monkeypatch.setattr(sys, "argv", ["actor", "--connect", "tcp/127.0.0.1:1", *options])
-    return actor.main()
+    return command.main()
 
 
 def test_a_standing_actor_ends_for_no_cause_of_others(script: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,7 +83,7 @@ def test_the_time_that_the_user_set_ends_a_standing_actor(
 
 
 def test_a_fault_of_ours_is_no_cause_of_others(script: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not actor._is_of_others(ZeroDivisionError())
+    assert not actor_process._is_of_others(ZeroDivisionError())
 
 
 @pytest.mark.parametrize(("stays", "status"), [(False, 1), (True, 0)])
@@ -94,7 +96,7 @@ def test_a_certificate_that_is_not_valid_now_is_no_bad_usage(
         if answers:
             raise answers.pop()
 
-    monkeypatch.setattr(actor, "credentials_to_connect", credentials)
+    monkeypatch.setattr(actor_process, "credentials_to_connect", credentials)
     script.append(False)
     assert run(monkeypatch, *(["--stay"] if stays else [])) == status
     assert not answers
@@ -105,5 +107,5 @@ def test_bad_usage_ends_a_standing_actor_at_its_start(script: list[Any], monkeyp
         raise CredentialsError("certs has no ca.pem")
 
     assert run(monkeypatch, "--stay", "--envs", "0") == 2
-    monkeypatch.setattr(actor, "credentials_to_connect", credentials)
+    monkeypatch.setattr(actor_process, "credentials_to_connect", credentials)
     assert run(monkeypatch, "--stay") == 2

@@ -1,4 +1,4 @@
-"""cli/status_query.py against the server of a learner: fleets of any size."""
+"""transport/status_query.py against the server of a learner: fleets of any size."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,10 +9,9 @@ import pytest
 from building import EPOCH, SPACES, run_context
 from statuses import actor_status, run_status
 
-from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
-from daedalus.cli.run_source import LearnerSource
-from daedalus.cli.status_query import ask, ask_events
+from daedalus.gateway.watching.learner_source import LearnerSource
+from daedalus.launch.prometheus_exporter import StatusCollector
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run import heartbeat
@@ -39,13 +38,14 @@ from daedalus.protocol.messages import (
 )
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+from daedalus.transport.status_query import ask, ask_events
 
 MANY = 905
 
 
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.cli.status_query._PAGES_SECONDS", 100.0)
+    monkeypatch.setattr("daedalus.transport.status_query._PAGES_SECONDS", 100.0)
 
 
 @pytest.fixture
@@ -196,7 +196,7 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr("daedalus.cli.commands.exporter._MAX_ACTORS", 2 * PAGE_ACTORS)
+    monkeypatch.setattr("daedalus.launch.prometheus_exporter._MAX_ACTORS", 2 * PAGE_ACTORS)
     collector = StatusCollector()
     collector.transport = operator
     samples = []

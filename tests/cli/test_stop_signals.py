@@ -12,13 +12,13 @@ SECONDS = 60.0  # generous for slow machines; a process that ignores the signal 
 
 PREAMBLE = """
     import os, sys, threading
-    from daedalus.cli import processes
+    from daedalus.launch import process_lifecycle
 """
 # A second lock of the same mutex never returns, and releases the interpreter's lock while it waits.
 STUCK = """
     import ctypes
-    processes._STUCK_SECONDS = 0.2
-    processes.stop_on_signals(exit_if_stuck=True)
+    process_lifecycle._STUCK_SECONDS = 0.2
+    process_lifecycle.stop_on_signals(exit_if_stuck=True)
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(128)
     print("ready", flush=True)
     while True:
@@ -27,9 +27,9 @@ STUCK = """
 # A call that Python repeats after each signal, such as a read of a simulator's answer.
 STUCK_IN_PYTHON = """
     import time
-    processes._STUCK_SECONDS = 0.2
-    processes._END_SECONDS = 1000.0
-    processes.stop_on_signals(exit_if_stuck=True)
+    process_lifecycle._STUCK_SECONDS = 0.2
+    process_lifecycle._END_SECONDS = 1000.0
+    process_lifecycle.stop_on_signals(exit_if_stuck=True)
     print("ready", flush=True)
     time.sleep(1000)
 """
@@ -37,15 +37,15 @@ STUCK_IN_PYTHON = """
 SEEN = """
     import functools, hashlib, operator, time, types
     def sleep(seconds):
-        if seconds == processes._END_SECONDS:
+        if seconds == process_lifecycle._END_SECONDS:
             seen.release()
         time.sleep(seconds)
     seen = threading.Lock()
     seen.acquire()
-    processes.time = types.SimpleNamespace(monotonic=time.monotonic, sleep=sleep)
-    processes._STUCK_SECONDS = 40.0  # even a busy machine notices the stop by then
-    stop = processes.stop_on_signals(exit_if_stuck=True)
-    processes.exit_with_parent(stop)
+    process_lifecycle.time = types.SimpleNamespace(monotonic=time.monotonic, sleep=sleep)
+    process_lifecycle._STUCK_SECONDS = 40.0  # even a busy machine notices the stop by then
+    stop = process_lifecycle.stop_on_signals(exit_if_stuck=True)
+    process_lifecycle.exit_with_parent(stop)
     print("ready", flush=True)
 """
 SLOW_END = f"""{SEEN}
@@ -63,7 +63,7 @@ NATIVE_THEN_WAIT = f"""{SEEN}
 """
 SEEN_BY_A_THREAD = """
     import ctypes
-    stop = processes.stop_on_signals()
+    stop = process_lifecycle.stop_on_signals()
     threading.Thread(target=lambda: (stop.wait(), os._exit(7))).start()
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(128)
     print("ready", flush=True)
@@ -72,7 +72,7 @@ SEEN_BY_A_THREAD = """
 """
 MANY = """
     import signal
-    stop = processes.stop_on_signals()
+    stop = process_lifecycle.stop_on_signals()
     storm = threading.Thread(target=lambda: [os.kill(os.getpid(), signal.SIGTERM) for _ in range(20_000)])
     print("ready", flush=True)
     stop.wait()
@@ -83,7 +83,7 @@ MANY = """
 """
 CHILD = """
     import signal, time
-    stop = processes.stop_on_signals()
+    stop = process_lifecycle.stop_on_signals()
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -103,9 +103,9 @@ CHILD = """
 # Nobody reads standard output, and the main thread holds the lock of the log while it writes there.
 BLOCKED_OUTPUT = """
     import logging
-    from daedalus.cli.logs import configure_logging
-    processes._STUCK_SECONDS = 0.2
-    processes.stop_on_signals(exit_if_stuck=True)
+    from daedalus.launch.logs import configure_logging
+    process_lifecycle._STUCK_SECONDS = 0.2
+    process_lifecycle.stop_on_signals(exit_if_stuck=True)
     configure_logging(process="actor")
     os.write(1, b"ready\\n")
     os.set_blocking(1, False)

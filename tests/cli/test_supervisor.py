@@ -1,4 +1,4 @@
-"""Test of cli/supervisor.py: the processes of `daedalus train`."""
+"""Test of launch/supervision.py: the processes of `daedalus train`."""
 
 import os
 import subprocess
@@ -11,14 +11,13 @@ from typing import Any
 import pytest
 from processes import LIMIT, until
 
-from daedalus.cli import supervisor
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.processes import STOPPED, UNSAVED
-from daedalus.cli.running.confirmation import Confirmations
-from daedalus.cli.running.local_run import LocalRun
-from daedalus.cli.running.run_observer import RunObserver
-from daedalus.cli.running.training import watch
-from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_actor
+from daedalus.launch import supervision
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.confirmation import Confirmations
+from daedalus.launch.local_run import LocalRun, RunObserver
+from daedalus.launch.local_training import watch
+from daedalus.launch.process_lifecycle import STOPPED, UNSAVED
+from daedalus.launch.supervision import FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 
@@ -95,7 +94,7 @@ def test_a_process_that_is_killed_from_outside_is_always_restarted() -> None:
 
 
 def test_a_crash_long_after_the_start_does_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "_SOON_SECONDS", 0.0)
+    monkeypatch.setattr(supervision, "_SOON_SECONDS", 0.0)
     process = supervised("import os; os.abort()")
     for _ in range(5):
         assert message(process) == "worker was killed by signal 6; started again"
@@ -132,7 +131,7 @@ def test_a_learner_that_a_signal_stopped_has_not_failed() -> None:
 
 
 def test_failures_long_after_the_start_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "_SOON_SECONDS", 0.0)
+    monkeypatch.setattr(supervision, "_SOON_SECONDS", 0.0)
     process = supervised("raise SystemExit(7)")
     for _ in range(5):
         message(process)
@@ -146,7 +145,7 @@ def test_a_process_that_ended_before_the_others_is_restarted(monkeypatch: pytest
     process.process.wait(LIMIT)
     assert process.check() is None
     assert process.restarts == 0
-    monkeypatch.setattr(supervisor, "_LEAVING_SECONDS", 0.0)
+    monkeypatch.setattr(supervision, "_LEAVING_SECONDS", 0.0)
     assert message(process) == "worker ended before the run; started again"
     stop([process.process])
 
@@ -154,7 +153,7 @@ def test_a_process_that_ended_before_the_others_is_restarted(monkeypatch: pytest
 def test_a_process_that_ends_early_again_and_again_is_not_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A module of the user may call `os._exit(0)`."""
     process = supervised("pass")
-    monkeypatch.setattr(supervisor, "_LEAVING_SECONDS", 0.0)
+    monkeypatch.setattr(supervision, "_LEAVING_SECONDS", 0.0)
     assert [message(process), message(process)] == ["worker ended before the run; started again"] * 2
     with pytest.raises(FailedError, match="worker ended 3 times before the run"):
         message(process)

@@ -22,8 +22,8 @@ ZENOH_ANSWER = """
 """
 PROGRAM = """
     import socket, threading, time
-    from daedalus.cli.logs import configure_logging
-    from daedalus.cli.processes import exit_on_thread_exceptions
+    from daedalus.launch.logs import configure_logging
+    from daedalus.launch.process_lifecycle import exit_on_thread_exceptions
     from daedalus.transport.zenoh_transport import listen
 
     def fail(*arguments):
@@ -50,10 +50,10 @@ def test_exception_in_a_thread_ends_the_process_with_a_traceback(cause: str) -> 
 def test_exception_ends_a_process_whose_output_nobody_reads() -> None:
     program = """
         import os, threading, time
-        from daedalus.cli import processes
+        from daedalus.launch import process_lifecycle
 
-        processes._TRACEBACK_SECONDS = 0.2
-        processes.exit_on_thread_exceptions()
+        process_lifecycle._TRACEBACK_SECONDS = 0.2
+        process_lifecycle.exit_on_thread_exceptions()
         os.set_blocking(2, False)
         try:
             while True:

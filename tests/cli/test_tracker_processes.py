@@ -1,4 +1,4 @@
-"""cli/tracking: the real trackers offline, whose files are read back, and trackers that fail or hang."""
+"""launch/tracker_processes.py: the real trackers offline, whose files are read back, and trackers that fail or hang."""
 
 import importlib.util
 import json
@@ -14,9 +14,9 @@ from processes import LIMIT, processes_mentioning, until
 from recorded_runs import record
 from trackers import mlflow_run, trackio_run, wandb_run
 
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.tracking import tracker_processes
-from daedalus.cli.tracking.tracker_processes import TrackerProcesses
+from daedalus.launch import tracker_processes
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics_rows import Details
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from recorded_runs import record
 
-from daedalus.cli.processes import UNREAD, exit_status
+from daedalus.launch.process_lifecycle import UNREAD, exit_status
 
 PROGRAM = "from daedalus.cli.main import main; raise SystemExit(main())"
 
@@ -48,8 +48,8 @@ def test_output_that_cannot_be_written_is_one_line(buffering: str) -> None:
 @pytest.mark.parametrize("buffering", ["", "1"])
 def test_a_finished_run_does_not_fail_because_its_result_cannot_be_printed(buffering: str) -> None:
     program = (
-        "from daedalus.cli.processes import exit_status\n"
-        "from daedalus.cli.run_report import show\n"
+        "from daedalus.launch.process_lifecycle import exit_status\n"
+        "from daedalus.cli.commands.train import show\n"
         "raise SystemExit(exit_status(lambda: show('the result', 'daedalus resume') or 3))"
     )
     command = [sys.executable, "-P", "-c", program]

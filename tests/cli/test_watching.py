@@ -10,7 +10,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from daedalus.cli.commands import train
-from daedalus.cli.other_runs import MAX_RUNS, OtherRuns
+from daedalus.launch.gateway_process import MAX_RUNS, OtherRuns
 
 Start = Callable[..., Running]
 
@@ -18,7 +18,7 @@ Start = Callable[..., Running]
 def test_watch_without_the_extra_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(train, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert train.train(["cartpole", "--watch", "--run-dir", str(tmp_path / "run")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("daedalus train: --watch: the gateway needs starlette")

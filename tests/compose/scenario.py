@@ -8,7 +8,8 @@ import yaml
 from composition import HERE, Compose
 from docker_host import run
 
-from daedalus.cli.settings_arguments import learner_parser, resolve
+from daedalus.cli.commands.learner import parser
+from daedalus.cli.settings_arguments import new_run
 
 Status = dict[str, Any]
 
@@ -27,8 +28,9 @@ def have_continued(before: dict[str, int], status: Status | None) -> bool:
 
 def test_the_command_of_the_endless_learner_is_valid() -> None:
     command = yaml.safe_load((HERE / "endless.yml").read_text())["services"]["learner"]["command"]
-    spec, directory = resolve(learner_parser().parse_args(command[1:]))
-    assert (spec.training.stop_when_solved, directory.name) == (False, "endless")
+    new = new_run(parser().parse_args(command[1:]))
+    assert new.directory is not None
+    assert (new.choice.spec().training.stop_when_solved, new.directory.name) == (False, "endless")
 
 
 def test_training_survives_killed_containers_and_solves_cartpole(compose: Compose, tmp_path: Path) -> None:

@@ -4,17 +4,16 @@ from collections.abc import Sequence
 
 import pytest
 
-from daedalus.cli import settings_arguments as learner_options
-from daedalus.cli.commands import actor_arguments as actor_options
-from daedalus.cli.commands import certs, exporter, router, status, train
+from daedalus.cli.commands import actor, certs, exporter, learner, router, status, train
+from daedalus.cli.settings_arguments import run_choice
 from daedalus.learner.run.settings import SettingsError
 from daedalus.transport.addresses import AddressError, check_listening
 
 PARSERS = {
-    "actor": actor_options.parser,
+    "actor": actor.parser,
     "certs": certs.parser,
     "exporter": exporter.parser,
-    "learner": learner_options.learner_parser,
+    "learner": learner.parser,
     "router": router.parser,
     "status": status.parser,
     "train": train.train_parser,
@@ -28,9 +27,9 @@ def check(words: Sequence[str]) -> str:
     try:
         parsed = PARSERS[command]().parse_args(arguments)
         if command in ("learner", "train"):
-            learner_options.resolve(parsed)
+            run_choice(parsed).spec()
         if command == "actor":
-            actor_options.config(parsed, None)
+            actor.actor_options(parsed).config(None)
         if command == "router":
             check_listening([parsed.listen], tls=parsed.tls is not None, insecure=parsed.insecure)
     except (SystemExit, SettingsError, AddressError, ValueError) as error:

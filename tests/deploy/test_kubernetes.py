@@ -16,8 +16,8 @@ from certificates import make_certificates
 from commands import check
 from processes import LIMIT, until
 
-from daedalus.cli.commands.learner import NOT_REACHED
-from daedalus.cli.processes import BAD_USAGE, SUPERSEDED
+from daedalus.launch.learner_process import NOT_REACHED
+from daedalus.launch.process_lifecycle import BAD_USAGE, SUPERSEDED
 from daedalus.protocol.keys import owner
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "kubernetes"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from daedalus.cli.prometheus_metrics import metrics
+from daedalus.launch.prometheus_exporter import metrics
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "prometheus"
 RULES = [rule for group in yaml.safe_load((FOLDER / "alerts.yml").read_text())["groups"] for rule in group["rules"]]

@@ -10,8 +10,8 @@ import pytest
 from pages import PAGES, ROOT, code_blocks, inline_code, name_of
 
 from daedalus.cli.command_table import COMMANDS
-from daedalus.cli.commands import actor_arguments, evaluate_arguments
-from daedalus.cli.settings_arguments import resolve
+from daedalus.cli.commands import actor, evaluate
+from daedalus.cli.settings_arguments import run_choice
 from daedalus.learner.run.settings import SettingsError
 from daedalus.transport.addresses import AddressError, check_listening
 
@@ -68,12 +68,12 @@ def check(words: Sequence[str], *, whole: bool = True) -> None:
         parsed = parse(words, whole=whole)
         if command in ("train", "learner") and (parsed.preset or parsed.env):
             if not (parsed.preset or "").endswith(".toml"):  # a file of the reader's
-                resolve(parsed)
+                run_choice(parsed).spec()
             check_listening(parsed.listen or [], tls=parsed.tls is not None, insecure=parsed.insecure)
         if command == "actor" and whole:
-            actor_arguments.config(parsed, None)
+            actor.actor_options(parsed).config(None)
         if command == "evaluate" and whole and not parsed.render:
-            evaluate_arguments.check(parsed)
+            evaluate.evaluation_options(parsed)
     except (SettingsError, AddressError, ValueError) as error:
         pytest.fail(f"`daedalus {' '.join(words)}` is refused: {error}")
     except SystemExit as end:

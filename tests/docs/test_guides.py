@@ -15,10 +15,10 @@ from plain import PlainEnvironments, act, choices, plain_spaces
 from recorded_runs import record
 
 from daedalus.actor.environments.make import make_environments
-from daedalus.cli.callbacks import TrainingRun
-from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.tracking.tracker_processes import TrackerProcesses
+from daedalus.launch.callbacks import TrainingRun
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.run_choice import with_record
+from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.trackers.tracker import tracker_name
 from daedalus.learner.run.settings import choose_algorithm, read_settings, run_spec
 from daedalus.learner.training.learner import Learner

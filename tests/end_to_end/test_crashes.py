@@ -18,8 +18,8 @@ LEARNER_FAULTS = {
 }
 
 ACTOR_FAULTS = {
-    "a Zenoh thread that brings an answer": "daedalus.actor.session.in_flight_rollouts:InFlightRollouts.acknowledge",
-    "a Zenoh thread that brings a snapshot": "daedalus.actor.session.learner_presence:LearnerPresence.heard",
+    "a Zenoh thread that brings an answer": "daedalus.actor.session.uploading:InFlightRollouts.acknowledge",
+    "a Zenoh thread that brings a snapshot": "daedalus.actor.session.snapshots:SnapshotFetcher._on_answer",
 }
 
 

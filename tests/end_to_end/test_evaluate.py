@@ -19,13 +19,12 @@ from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.analysis.recorded_run import read_record
-from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate import main
-from daedalus.cli.evaluation_processes import EvaluationFailedError
-from daedalus.cli.run_report import report as report_of
-from daedalus.cli.running.confirmation import Confirmations
-from daedalus.cli.running.final_evaluation import evaluate_run
-from daedalus.cli.running.local_run import LocalRun
+from daedalus.cli.commands.train import report as report_of
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.confirmation import Confirmations
+from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
+from daedalus.launch.local_run import LocalRun
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_directory import create, read_json, write_config, write_json
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
@@ -485,7 +484,7 @@ def test_progress_is_written_to_standard_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1)
-    monkeypatch.setattr("daedalus.cli.evaluation_progress._SECONDS", 0.0)
+    monkeypatch.setattr("daedalus.launch.evaluation._PROGRESS_SECONDS", 0.0)
     options = ["--json", "--episodes", "2", "--envs", "1", "--allow-module", "counting_environment"]
     assert main([str(run), *options]) == 0
     captured = capsys.readouterr()

@@ -11,8 +11,8 @@ import pytest
 import safetensors.numpy
 from processes import LIMIT, Running, until
 
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run import run_directory

@@ -252,7 +252,7 @@ def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: St
     assert running.wait() in (0, 3), running.output
     records = [json.loads(line) for line in running.lines if line.startswith("{")]
     assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
-    assert {"daedalus.cli.running.training", "daedalus.learner.serving.events"} <= {
+    assert {"daedalus.launch.local_training", "daedalus.learner.serving.events"} <= {
         record["logger"] for record in records
     }
     plain = [line for line in running.lines if not line.startswith("{")]

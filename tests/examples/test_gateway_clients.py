@@ -10,8 +10,8 @@ import node
 import pytest
 from processes import Running, until
 
-from daedalus.cli.status_query import ask
 from daedalus.transport.connecting import connect
+from daedalus.transport.status_query import ask
 
 FOLDER = Path(__file__).parents[2] / "examples" / "gateway"
 COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]

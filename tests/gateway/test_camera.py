@@ -29,7 +29,7 @@ from daedalus.protocol.messages import Snapshot, Welcome
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
-COMMAND = (sys.executable, "-P", "-m", "daedalus.cli.commands.camera")
+COMMAND = (sys.executable, "-P", "-m", "daedalus.launch.camera_process")
 STATE = np.zeros((3, 0), np.float32)
 
 
@@ -173,7 +173,7 @@ def children() -> list[int]:
             words = (entry / "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        if parent == os.getpid() and b"daedalus.cli.commands.camera" in words:
+        if parent == os.getpid() and b"daedalus.launch.camera_process" in words:
             found.append(int(entry.name))
     return found
 

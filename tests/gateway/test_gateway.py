@@ -15,7 +15,6 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
-from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.gateway import client_gateway, connection, policy_versions, server
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_gateway import Gateway
@@ -23,10 +22,10 @@ from daedalus.gateway.client_messages import Act
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, PolicyError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport import retries
-from daedalus.transport.interface import Declaration, TransportError
+from daedalus.transport.interface import Declaration, Request, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 Connect = Callable[..., JsonClient]
@@ -378,15 +377,16 @@ def test_request_to_join_is_prepared_once_and_sent_again_until_it_is_answered(
     learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepared, asked = [], []
-    prepare, request_join = ClientActor.prepare, LearnerQueries.request_join
+    prepare, answer = ClientActor.prepare, learner._join
 
-    def unanswered_twice(queries: LearnerQueries, run: str, join: Join) -> Welcome | None:
-        if join.actor == "arm-1":
-            asked.append(join)
-        return None if join.actor == "arm-1" and len(asked) < 3 else request_join(queries, run, join)
+    def unanswered_twice(request: Request) -> None:
+        if request.key.endswith("/arm-1"):
+            asked.append(request.key)
+        if request.key not in asked or len(asked) == 3:
+            answer(request)
 
     monkeypatch.setattr(ClientActor, "prepare", lambda actor, spec: prepared.append(spec) or prepare(actor, spec))
-    monkeypatch.setattr(LearnerQueries, "request_join", unanswered_twice)
+    learner.transport.serve(keys.join("r", "*"), unanswered_twice)
     assert connect().hello("arm-1")["type"] == "welcome"
     assert (len(prepared), len(asked)) == (1, 3)
 

@@ -17,12 +17,12 @@ from processes import LIMIT, Running, starting, until
 from scripted_learner import SPEC, ScriptedLearner, acknowledge
 from watched import HOSTILE, actor_status, observed, run_status
 
-from daedalus.cli.status_query import ask
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import OperatorToken
 from daedalus.protocol.messages import Event, Order
 from daedalus.transport.connecting import connect
 from daedalus.transport.memory import MemoryNetwork
+from daedalus.transport.status_query import ask
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Debian's chromium")
 MILLISECONDS = 1000 * LIMIT

@@ -12,9 +12,9 @@ from gateways import JsonClient
 from processes import Running, until
 from websockets.exceptions import ConnectionClosed
 
-from daedalus.cli.status_query import ask
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import Transport
+from daedalus.transport.status_query import ask
 
 Start = Callable[..., Running]
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)

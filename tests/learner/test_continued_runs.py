@@ -94,7 +94,7 @@ def test_progress_is_the_used_share_of_the_budget_and_at_most_1() -> None:
     used_up = annealing.resumed(705, 1400)
     assert [used_up.at(env_steps) for env_steps in (705, 1000, 1400)] == [1.0, 1.0, 1.0]
     resumed = annealing.resumed(300, 1100)
-    assert Annealing(**json.loads(json.dumps(resumed.state()))) == resumed
+    assert Annealing(**json.loads(json.dumps(resumed.model_dump()))) == resumed
 
 
 @pytest.mark.parametrize("budget", [1400, 400])

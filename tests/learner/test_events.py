@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from log_lines import LINES
 
-from daedalus.cli.logs import EVENTS
+from daedalus.launch.logs import EVENTS
 from daedalus.learner.serving import events
 from daedalus.learner.serving.events import EventFile, EventLog, read_events
 from daedalus.protocol.messages import Event

@@ -19,8 +19,8 @@ from processes import LIMIT, until
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.config import ActorConfig
-from daedalus.actor.session.service import ActorService
+from daedalus.actor.session.actor_config import ActorConfig
+from daedalus.actor.session.actor_service import ActorService
 from daedalus.analysis.recorded_run import read_metrics
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics_rows import Details

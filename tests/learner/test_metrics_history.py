@@ -1,4 +1,4 @@
-"""learner/reporting/metrics_rows.py and metrics_file.py: the metrics of a run, bounded, and read from its file."""
+"""learner/reporting/metrics_rows.py: the metrics of a run, bounded, and read from its file."""
 
 from pathlib import Path
 

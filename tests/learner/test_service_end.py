@@ -13,7 +13,7 @@ from processes import LIMIT, until
 from session_fleet import GatedActor, LearnerProcess
 
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.config import ActorConfig
+from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.learner.reporting import recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run import heartbeat

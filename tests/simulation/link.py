@@ -113,30 +113,45 @@ class Link:
         self.handlers[key] = handler, Channel(self.process, "query")
 
     def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
-        self._enter("query")
         kernel, task = self.network.kernel, self.network.kernel.current
+        came: list[list[bytes]] = []
+
+        def on_answers(answers: list[bytes]) -> None:
+            came.append(answers)
+            kernel.wake(task)
+
+        self.ask(key, payload, timeout, on_answers)
+        while not came:
+            kernel.park(None)
+        return came[0]
+
+    def ask(self, key: str, payload: bytes, timeout: float, on_answers: Callable[[list[bytes]], None]) -> None:
+        """Query without waiting; call `on_answers` once, with all answers that arrive in time."""
+        self._enter("query")
+        network, kernel = self.network, self.network.kernel
         answers: list[bytes] = []
-        servers = self.network.servers(key) if self.passes() else []
-        left = len(servers)
-        waits = False
+        servers = network.servers(key) if self.passes() else []
+        left, over = len(servers), False
+
+        def end() -> None:
+            nonlocal over
+            if not over:
+                over = True
+                on_answers(list(answers))
 
         def on_answer(answer: bytes | None) -> None:
             nonlocal left
             left -= 1
             if answer is not None:
                 answers.append(answer)
-            if left == 0 and waits:
-                kernel.wake(task)
+            if left == 0:
+                end()
 
         for server, served in servers:
             self._send(server, served, key, payload, timeout, on_answer, finds_others=False)
-        if servers:
-            waits = True
-            kernel.park(timeout)
-            waits = False
-            return list(answers)
-        kernel.sleep(self.network.delay() if self.passes() or self.network.chance(0.5) else timeout)
-        return []
+        if not servers and (self.passes() or network.chance(0.5)):
+            timeout = network.delay()
+        kernel.after(timeout, Channel(self.process, "answers").deliver, end)
 
     def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
         self._enter("query")
@@ -225,9 +240,26 @@ class Link:
         if unless_served is not None and any(not link.dead for link, _ in network.servers(unless_served)):
             kernel.sleep(network.delay())
             return False
+        return self._replace_session()
+
+    def reopen_later(self, on_end: Callable[[], None]) -> None:
+        """Open another session without waiting, if the router can be reached; call `on_end` then."""
+        network = self.network
+        is_cut = self.cut or network.cut
+        channel = Channel(self.process, "reopened")
+        seconds = network.delay() + (network.kernel.random.random() if is_cut else 0.0)
+
+        def end() -> None:
+            if not is_cut:
+                self._replace_session()
+            on_end()
+
+        network.kernel.after(seconds, channel.deliver, end)
+
+    def _replace_session(self) -> bool:
         if not self.alive:
             return False
-        kernel.log("session reopened", self.process.name)
+        self.network.kernel.log("session reopened", self.process.name)
         self.session += 1
         self.dead = self.expired = False
         for query in list(self.queries):

@@ -10,7 +10,9 @@ from .kernel import Kernel, Task
 class Process:
     """A simulated process: threads that are frozen and killed together."""
 
-    def __init__(self, kernel: Kernel, name: str) -> None:
+    def __init__(self, kernel: Kernel, name: str, *, has_threads: bool = True) -> None:
+        """Construct the process. One without threads only reacts to deliveries."""
+        self.has_threads = has_threads
         self.kernel, self.name = kernel, name
         self.alive, self.frozen = True, False
         self.locks_held = 0  # by threads of this process that do not run now
@@ -67,7 +69,9 @@ class Channel:
         if process.frozen:
             process.defer(self, function, arguments)
             return
-        if self._busy or process.locks_held or kernel.fine_files or kernel.random.random() < 0.1:
+        if process.has_threads and (
+            self._busy or process.locks_held or kernel.fine_files or kernel.random.random() < 0.1
+        ):
             self._waiting.append((function, arguments))
             if not self._busy:
                 self._busy = True

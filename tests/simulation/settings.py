@@ -59,6 +59,7 @@ def draw(seed: int) -> Settings:
     spec = _spec(random, message_bytes=1000 if real_codec else codec.SIZE)
     faulty = random.uniform(1.0, 12.0)
     collect = random.choice((0.1, 0.5, 1.0))
+    poll = random.choice((0.2, 2.0, 2.0, 2.0))  # a long one shows a thread that should have been told
     return Settings(
         spec=spec,
         embedded=random.random() < 0.5,
@@ -66,24 +67,25 @@ def draw(seed: int) -> Settings:
         weather=_weather(random),
         faulty_seconds=faulty,
         faults=_faults(random, faulty),
-        actors=tuple(_actor(random, spec, collect) for _ in range(spec.collection.actors + _MORE_ACTORS)),
+        actors=tuple(_actor(random, spec, collect, poll) for _ in range(spec.collection.actors + _MORE_ACTORS)),
         train_seconds=random.choice((0.0, 0.01, 0.1, 0.5)),
         checkpoint_seconds=random.choice((0.1, 0.1, 60.0)),
         ends_by=random.choice(("finish", "stop")),
         real_codec=real_codec,
-        poll_seconds=random.choice((0.2, 2.0, 2.0, 2.0)),  # a long one shows a thread that should have been told
+        poll_seconds=poll,
         patience_seconds=random.choice((60.0, 3.0)),
         fine=random.random() < 0.03,
     )
 
 
-def _actor(random: Random, spec: RunSpec, seconds: float) -> ActorSettings:
+def _actor(random: Random, spec: RunSpec, seconds: float, poll: float) -> ActorSettings:
     is_client = not spec.algorithm.synchronous and random.random() < 0.2
     return ActorSettings(
         kind="client" if is_client else "environments",
         link=random.choice(("lan", "lan", "lan", "wan", "auto")),
         run=random.choice((RUN, ANY_RUN)),
         collect_seconds=seconds * random.uniform(0.7, 1.3),
+        poll_seconds=poll,
     )
 
 

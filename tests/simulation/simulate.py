@@ -11,17 +11,14 @@ from random import Random
 from types import ModuleType
 from typing import Any
 
-from daedalus.actor.session import runtime_maker
 from daedalus.learner.serving import actor_server  # noqa: F401 - imports all modules that are patched
 from daedalus.protocol import codec as real_codec
 
-from . import codec, faults, primitives
-from .actors import Runtime
+from . import actors, codec, faults, primitives
 from .kernel import Kernel
 from .settings import Settings, draw
 from .world import World
 
-_PATCHED = ("daedalus.actor.session.", "daedalus.learner.serving.")
 _PROGRESS_SECONDS = 150.0  # after the last fault: every actor is trained on again
 _END_SECONDS = 15.0  # after the end of the run: every actor has ended
 
@@ -72,8 +69,12 @@ def simulate(seed: int) -> Result:
 
 
 def services() -> list[ModuleType]:
-    """Return the modules of the services, whose threads and time are simulated."""
-    return [module for name, module in list(sys.modules.items()) if name.startswith(_PATCHED)]
+    """Return the modules of the learner's services, whose threads and time are simulated."""
+    return _modules("daedalus.learner.serving.")
+
+
+def _modules(*prefixes: str) -> list[ModuleType]:
+    return [module for name, module in list(sys.modules.items()) if name.startswith(prefixes)]
 
 
 def _fine_files() -> frozenset[str]:
@@ -82,33 +83,36 @@ def _fine_files() -> frozenset[str]:
 
 @contextlib.contextmanager
 def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
-    """Give the services the kernel's threads and time, and a policy that is never run."""
-    constants = {
-        "_POLL_SECONDS": settings.poll_seconds,
-        "POLL_SECONDS": settings.poll_seconds,
-        "_PATIENCE_SECONDS": settings.patience_seconds,
-        "PART_BYTES": 64,  # so that a compact snapshot has several parts
-    }
-    replaced: list[tuple[Any, str, Any]] = []
+    """Give the learner's services the kernel's threads and time, and messages that travel as objects to all."""
     fakes = primitives.modules(kernel)
     replacements: dict[int, Any] = {
         id(threading): fakes["threading"],
         id(time): fakes["time"],
         id(queue): fakes["queue"],
-        id(runtime_maker.OnnxRuntime): Runtime,
     }
-    if not settings.real_codec:
-        replacements |= {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}
-    for module in services():
-        for attribute, value in list(vars(module).items()):
-            if id(value) in replacements or attribute in constants:
-                replaced.append((module, attribute, value))
-                setattr(module, attribute, constants.get(attribute, replacements.get(id(value))))
-    try:
+    constants = {
+        "POLL_SECONDS": settings.poll_seconds,
+        "_PATIENCE_SECONDS": settings.patience_seconds,
+        "PART_BYTES": 64,  # so that a compact snapshot has several parts
+    }
+    codecs: dict[int, Any] = {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}
+    talking = services() + _modules("daedalus.actor.session.", actors.__name__)
+    with contextlib.ExitStack() as patches:
+        for module in services():
+            _replace(patches, module, replacements, constants)
+        for module in [] if settings.real_codec else talking:
+            _replace(patches, module, codecs, {})
         yield
-    finally:
-        for module, attribute, value in replaced:
-            setattr(module, attribute, value)
+
+
+def _replace(
+    patches: contextlib.ExitStack, module: ModuleType, replacements: dict[int, Any], constants: dict[str, Any]
+) -> None:
+    """Replace values of a module, by identity or by name, until the patches end."""
+    for name, value in list(vars(module).items()):
+        if id(value) in replacements or name in constants:
+            patches.callback(setattr, module, name, value)
+            setattr(module, name, constants.get(name, replacements.get(id(value))))
 
 
 def _faulty_phase(world: World) -> None:
@@ -143,10 +147,10 @@ def _require_no_loss(world: World) -> None:
     """Check that the learner has decided about each rollout of the present sessions, unless it is in flight."""
     learner = world.learner
     for actor in world.running:
-        uploads = actor.service._upload_session.in_flight.rollouts
+        uploads = actor.session.uploads.in_flight.rollouts
         for identity in world.ledger.collected:
             if (identity.incarnation, identity.learner_epoch) == (actor.incarnation, learner.epoch):
-                is_waiting = identity.sequence in uploads or identity.sequence >= actor.service._sequence
+                is_waiting = identity.sequence in uploads or identity.sequence >= actor.session.sequence
                 world.ledger.require(is_waiting or learner.life.has_verdict(identity), "lost:", identity)
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
-from daedalus.actor.session.snapshot_feed import SnapshotFeed
+from daedalus.actor.session.snapshots import SnapshotFeed
+from daedalus.actor.session.uploading import InFlightRollouts
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import SequenceWindow
 from daedalus.learner.serving.rollout_judge import RolloutJudge
@@ -115,7 +115,7 @@ def drops_without_an_answer(patch: pytest.MonkeyPatch) -> None:
 
 
 def requests_no_lost_snapshot(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(SnapshotFeed, "request_newest", lambda _feed: None)
+    patch.setattr(SnapshotFeed, "request_newest", lambda _feed: ())
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ class World:
     def stop_actor(self, actor: ActorProcess) -> None:
         """Ask an actor to stop, as SIGTERM does."""
         self.kernel.log("stop", actor.process.name)
-        actor.stop.set()
+        actor.stopping = True
         seconds = _STOP_SECONDS + self.settings.poll_seconds
         self.kernel.after(seconds, self._require_end, actor, seconds)
         self.kernel.after(0.0, self._time_stop, actor, self.kernel.now)

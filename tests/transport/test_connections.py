@@ -186,7 +186,7 @@ def test_transport_whose_session_does_not_close_is_given_up(
 
 PROGRAM = """
 import sys, threading
-from daedalus.cli.processes import exit_status
+from daedalus.launch.process_lifecycle import exit_status
 from daedalus.transport.slow_calls import SlowCall
 
 def command():

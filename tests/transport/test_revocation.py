@@ -14,7 +14,7 @@ from log_lines import LINES
 from processes import LIMIT, until
 from routers import listen_somewhere
 
-from daedalus.cli.certificate_folder import CertificateFolder, Identity
+from daedalus.launch.certificates import CertificateFolder, Identity
 from daedalus.protocol import keys
 from daedalus.transport import credentials
 from daedalus.transport.credentials import Credentials, CredentialsError, load

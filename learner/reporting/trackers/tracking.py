@@ -43,12 +43,15 @@ class TrackingState:
 
 
 def chosen_trackers(chosen: Sequence[str], directory: Path) -> Sequence[str]:
-    """Return the trackers of a run: those that the user has chosen, and those that have logged it before."""
+    """Return the trackers of a run: those that the user has chosen, and those that have logged it before.
+
+    A metrics writer of the user's is not continued by itself: a file must not say which module is imported.
+    """
     return list(dict.fromkeys([*chosen, *(name for name in TRACKERS if _path(directory, name).exists())]))
 
 
 def _path(directory: Path, name: str) -> Path:
-    return directory / TRACKER.format(name)
+    return directory / TRACKER.format(name.replace(":", "."))
 
 
 class MetricsFollower:

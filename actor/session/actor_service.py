@@ -1,0 +1,121 @@
+"""The actor's service: the session engine on the caller's thread, with the environments and the policy.
+
+The only threads are the caller's, which `run` occupies, and the transport's.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.errors import ActorError
+from daedalus.actor.session.actor_config import ActorConfig, own_origin
+from daedalus.actor.session.conversation import RunOverError
+from daedalus.actor.session.session_engine import ActorSession, Begin, Collect, Encode, Load, Prepare
+from daedalus.actor.session.session_thread import SessionThread
+from daedalus.actor.session.uploading import RolloutUploadMaker, UploadMaker, make_upload_maker
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import ClientReport, Welcome
+from daedalus.protocol.spec import UnsupportedRunError
+from daedalus.transport.interface import Transport
+
+_logger = logging.getLogger(__name__)
+
+
+class ActorService:
+    """One actor over one transport."""
+
+    def __init__(
+        self,
+        config: ActorConfig,
+        transport: Transport,
+        stop: threading.Event,
+        collector: Collector | None = None,
+        on_join: Callable[[Welcome], object] = lambda _: None,
+        report: Callable[[], ClientReport] | None = None,
+    ) -> None:
+        """Construct the service.
+
+        Args:
+          config: settings of this actor.
+          transport: the network; the caller closes it.
+          stop: event that ends `run`.
+          collector: replaces the environments that the actor would create.
+          on_join: called with the answer of each learner that the actor begins to join.
+          report: returns what a client counts about itself; None: this actor is no client.
+        """
+        self._config, self._stop, self._on_join = config, stop, on_join
+        self._collector = collector or EnvironmentCollector(config.environments, config.modules)
+        self._session = ActorSession(config, own_origin(transport), report)
+        self._thread = SessionThread(self._session, transport, stop)
+        self._upload_maker: UploadMaker = RolloutUploadMaker()  # what is uploaded of the rollouts
+
+    def run(self) -> bool:
+        """Collect until `stop` or until the learner says that the run is over; return whether the run finished.
+
+        Raises ActorError if the actor is refused or quarantined, or finds no learner within its timeout;
+        EnvironmentSetupError if the environment cannot be created here; PolicyError if the policy does not run.
+        """
+        try:
+            return self._thread.run(self._session.play(), self._perform)  # until it raises
+        except RunOverError as error:
+            _logger.info("%s", error)
+            return error.finished
+        except Exception as error:
+            self._thread.run(self._session.report_failure(error), to_the_end=True)
+            raise
+        finally:
+            self._collector.close()
+
+    def wake(self) -> None:
+        """End a wait for a rollout of the collector. From any thread."""
+        self._thread.notify(self._note_rollout)
+
+    def _note_rollout(self) -> None:
+        self._session.rollout_ready = True
+
+    def _perform(self, action: Any) -> Any:
+        """Perform an action of the session, and return what came of it."""
+        match action:
+            case Collect(identity):
+                return self._collector.collect(identity, self._on_row)
+            case Encode(rollout):
+                return encode(self._upload_maker.compute(rollout))
+            case Load(snapshot, confirmed_at):
+                if snapshot is not None:
+                    self._collector.load(snapshot)
+                    self._upload_maker.load(snapshot.weights)
+                self._collector.confirm(confirmed_at)
+            case Prepare(welcome):
+                self._on_join(welcome)
+                return self._collector.prepare(welcome.spec)
+            case Begin(welcome):
+                self._collector.begin(
+                    self._runtime(action), welcome.spec, welcome.entropy(self._config.name), welcome.epsilon
+                )
+                self._upload_maker = make_upload_maker(welcome.spec, action.spaces, self._config.modules)
+        return None
+
+    def _on_row(self) -> None:
+        if self._session.is_fetch_due(time.monotonic()):
+            self._thread.call(self._session.fetch_next)
+        else:
+            self._thread.call_after_events(self._session.check_over)
+
+    def _runtime(self, begin: Begin) -> PolicyRuntime:
+        """Return the runtime of the policy."""
+        spec = begin.welcome.spec
+        if begin.program is not None:
+            rows = begin.environments * spec.collection.rollout_length  # a rollout is played with one snapshot
+            return OnnxRuntime(begin.program, self._stop, rows)
+        from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
+
+        try:
+            learning = spec.learning_settings
+        except UnsupportedRunError as error:
+            raise ActorError(str(error)) from None
+        return TorchRuntime(learning.policy, begin.spaces, learning.training)

@@ -1,0 +1,117 @@
+"""Runs as their learners report them, query after query, for a live display."""
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+
+from daedalus.gateway.watching.learner_source import LearnerSource
+from daedalus.learner.reporting.progress import StepRate
+from daedalus.protocol import keys
+from daedalus.protocol.codec import ProtocolError
+from daedalus.protocol.messages import MetricsReport, RunStatus
+from daedalus.transport.interface import RefusedError, Transport, TransportError
+from daedalus.transport.status_query import ask
+
+_RETURN = "episode_return_mean"
+_MAX_RETURNS = 4096  # then every second one is dropped
+
+
+class WatchedRun:
+    """Newest status of a learner, and the returns of its whole run."""
+
+    def __init__(self, status: RunStatus) -> None:
+        self.status = status
+        self.returns: list[float] = []  # mean of the newest episodes, from the begin of the run on
+        self.rate = 0.0  # env_steps per second, over the last seconds
+        self.next_row = 0  # of the metrics, not seen yet
+        self._meter = StepRate()
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds until the budget is used up, or None if it is not known. A run may reach its target before."""
+        left = self.status.env_steps_budget - self.status.env_steps
+        return max(left, 0) / self.rate if self.rate > 0.0 else None
+
+    def add_status(self, status: RunStatus) -> None:
+        """Take a newer status of the same learner."""
+        self.status = status
+        self.rate = self._meter.add(status.uptime_seconds, status.env_steps) or status.env_steps_per_second
+
+    def add_rows(self, report: MetricsReport) -> None:
+        """Take further rows of the metrics."""
+        if not len(report.numbers):
+            return
+        self.next_row = int(report.numbers[-1]) + 1
+        if _RETURN in report.page.columns:
+            values = report.values[:, report.page.columns.index(_RETURN)].tolist()
+            self.returns += [value for value in values if math.isfinite(value)]
+        while len(self.returns) > _MAX_RETURNS:
+            del self.returns[::2]
+
+
+MAX_ACTORS = 50  # of each run that are queried; a terminal has no lines for more
+_MOST_PAGES = 8  # of the metrics for one look
+
+
+class RunWatcher:
+    """Watcher of the learners that answer at an address."""
+
+    def __init__(self, transport: Transport, run: str = keys.ANY_RUN) -> None:
+        """Construct the watcher. `run` is the name of the run, or `*` for all runs."""
+        self._transport, self._run = transport, run
+        self._source = LearnerSource(transport, run)
+        self._runs: dict[int, WatchedRun] = {}  # by learner epoch
+
+    def look(self) -> list[WatchedRun]:
+        """Return the runs whose learners answer. Raises TransportError or ProtocolError."""
+        runs: dict[int, WatchedRun] = {}
+        for status in ask(self._transport, self._run, max_actors=MAX_ACTORS):
+            run = runs[status.learner_epoch] = self._runs.get(status.learner_epoch) or WatchedRun(status)
+            run.add_status(status)
+            for _ in range(_MOST_PAGES):
+                report = self._source.metrics(status, run.next_row)
+                if report is None or not len(report.numbers):
+                    break
+                run.add_rows(report)
+        self._runs = runs
+        return sorted(runs.values(), key=lambda run: run.status.run)
+
+
+def looks(
+    connect: Callable[[], Transport], run: str, stop: threading.Event, seconds: float
+) -> Iterator[list[WatchedRun]]:
+    """Yield the runs that answer, every few seconds; an empty list while none does. Reconnect if the network fails.
+
+    Args:
+      connect: opens the transport. Raises TransportError.
+      run: name of the run, or `*` for all runs.
+      stop: ends the iteration.
+      seconds: from one look to the next.
+
+    Raises RefusedError.
+    """
+    while not stop.is_set():
+        try:
+            transport = connect()
+        except RefusedError:
+            raise
+        except TransportError:
+            yield []
+            stop.wait(seconds)
+            continue
+        try:
+            watcher = RunWatcher(transport, run)
+            while not stop.is_set() and (runs := watcher.look()):
+                yield runs
+                stop.wait(seconds)
+        except ProtocolError as error:
+            raise TransportError(f"the answer of the learner is damaged: {error}") from None
+        except RefusedError:
+            raise
+        except TransportError:
+            pass  # connect again
+        finally:
+            transport.close()
+        if not stop.is_set():
+            yield []
+            stop.wait(seconds)

@@ -1,1 +1,0 @@
-"""One run on this machine: its processes, their supervision, and the evaluation of its result."""

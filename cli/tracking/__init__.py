@@ -1,1 +1,0 @@
-"""Processes that log a run to experiment trackers."""

@@ -1,1 +1,0 @@
-"""Live display of runs on a terminal."""

@@ -1,0 +1,158 @@
+"""The process of `daedalus actor`: construct one actor and run it.
+
+Exit status: 0 the run is over, the actor was stopped or an operator drained it; 1 failed; 2 bad usage. With --stay,
+an actor ends by a signal, a drain, wrong arguments, or after the --timeout that its user set; all other failures have
+causes that somebody else can remove, so it reports them and tries again.
+"""
+
+import logging
+import secrets
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.errors import ActorError, NoLearnerError
+from daedalus.actor.evaluation.evaluator import Evaluator
+from daedalus.actor.session.actor_config import ActorConfig, own_name
+from daedalus.actor.session.actor_service import ActorService
+from daedalus.launch.logs import print_error
+from daedalus.launch.process_lifecycle import FAILED, status_at_start
+from daedalus.policy.acting.runtime import PolicyError
+from daedalus.policy.user_code import frames_of, is_of_user
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol import keys
+from daedalus.protocol.messages import Welcome
+from daedalus.transport.connecting import connect_with_retry
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect
+from daedalus.transport.interface import TransportError, UnreachableError
+from daedalus.transport.retries import Retries
+
+_logger = logging.getLogger(__name__)
+
+_REPORTED = (ActorError, EnvironmentSetupError, PolicyError, TransportError)  # each in one line
+_NEXT_RUN_SECONDS = 2.0  # after a run, before the next is looked for: its learner may answer for some seconds more
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorOptions:
+    """What an actor process was started with."""
+
+    connect: list[str]
+    tls: Path | None = None
+    evaluator: bool = False  # play the evaluations of the run instead of sending rollouts
+    stay: bool = False  # wait for the next run, and try again after failures that others may remove
+    name: str | None = None  # None: made from the name of the host
+    run: str = keys.ANY_RUN
+    any_run: bool = False
+    environments: int | None = None  # None: as the learner asks
+    runtime: Literal["onnx", "torch"] = "onnx"
+    link: Literal["auto", "lan", "wan"] = "auto"
+    timeout: float | None = None
+    allowed_modules: frozenset[str] = frozenset()
+
+    def config(self, credentials: Credentials | None) -> ActorConfig:
+        """Return the checked configuration. Raises ValueError with a message of one line."""
+        if self.environments is not None and not 1 <= self.environments <= 4096:
+            raise ValueError(f"--envs is {self.environments}: choose a number from 1 to 4096")
+        if self.run != keys.ANY_RUN:
+            keys.check_name(self.run, "run")
+        name = self.name or own_name(credentials.name if credentials else "")
+        if credentials and credentials.name not in (name, name.partition(".")[0]):
+            raise ValueError(
+                f"the certificate in {credentials.directory} is not for {name!r}: "
+                f"use --name {credentials.name} or {credentials.name}.ANYTHING"
+            )
+        return ActorConfig(
+            name=keys.check_name(name, "actor name"),
+            incarnation=secrets.randbits(62),
+            run=self.run,
+            environments=self.environments,
+            runtime=self.runtime,
+            modules=UserModules(self.allowed_modules, "the learner"),
+            link=self.link,
+            timeout=self.timeout,
+            any_run=self.any_run,
+        )
+
+
+def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, str]) -> int:
+    """Run an actor, report why it fails, and return the exit status.
+
+    Args:
+      options: what the process was started with.
+      stop: ends the actor.
+      context: receives the fields of the log.
+    """
+    retries = Retries(stop)
+    while True:
+        try:
+            credentials = credentials_to_connect(options.connect, options.tls, "actor")
+            config = options.config(credentials)
+            break
+        except (ValueError, *SECURITY_ERRORS) as error:
+            if not (options.stay and isinstance(error, NotValidNowError)):
+                print_error("actor", error)
+                return status_at_start(error)
+            if retries.wait(str(error)):
+                return 0
+    context["actor"] = config.name
+
+    def note(welcome: Welcome) -> None:
+        context.update(run=welcome.run, epoch=f"{welcome.learner_epoch:x}")
+
+    while True:
+        try:
+            finished = _serve_run(options, config, credentials, stop, note)
+        except Exception as error:  # broad: see _is_of_others
+            if not options.stay or not _is_of_others(error):
+                if not isinstance(error, _REPORTED):
+                    raise
+                print_error("actor", error)
+                return FAILED
+            if not isinstance(error, _REPORTED):
+                _logger.exception("a module of the run has failed")
+            stopped = retries.wait(str(error) or type(error).__name__)
+        else:
+            if not (finished and options.stay):
+                return 0
+            retries.succeeded()
+            _logger.info("waiting for the next run")
+            stopped = stop.wait(_NEXT_RUN_SECONDS)
+        if stopped:
+            return 0
+        config = replace(config, incarnation=secrets.randbits(62))
+
+
+def _is_of_others(error: Exception) -> bool:
+    """Return whether somebody else can remove the cause of an error, such as who started a run or renews certificates.
+
+    Not the end of the time that the user of this actor set, and no fault of ours. A module of the run may raise
+    anything.
+    """
+    if isinstance(error, (NoLearnerError, UnreachableError)):
+        return False
+    of_users = (frame for frame in frames_of(error) if is_of_user(frame))
+    return isinstance(error, _REPORTED) or any(
+        frame.tb_frame.f_globals.get("__name__") != "__main__" for frame in of_users
+    )
+
+
+def _serve_run(
+    options: ActorOptions,
+    config: ActorConfig,
+    credentials: Credentials | None,
+    stop: threading.Event,
+    on_join: Callable[[Welcome], None],
+) -> bool:
+    """Take part in one run; return whether the run finished. Raises what `main` reports."""
+    transport = connect_with_retry(options.connect, stop, config.timeout, credentials)
+    if transport is None:
+        return False
+    try:
+        role = Evaluator if options.evaluator else ActorService
+        return role(config, transport, stop, on_join=on_join).run()
+    finally:
+        transport.close()

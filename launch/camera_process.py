@@ -1,0 +1,204 @@
+"""The process of a gateway's camera: plays episodes with the newest policy, and writes what the page shows.
+
+The gateway starts it while somebody watches. It has no network: see gateway/watching/camera.py for its messages. It
+runs at the lowest priority. Exit status: 0 the gateway has closed its input or stopped it, 1 failed.
+"""
+
+import argparse
+import logging
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
+from daedalus.gateway.watching.camera import LENGTH, frame, note
+from daedalus.launch.logs import configure_logging
+from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, stop_on_signals
+from daedalus.learner.run.run_directory import run_name
+from daedalus.policy.acting.program_check import PolicyError
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_code import first_line
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.limits import LEARNER_LIMITS
+from daedalus.protocol.messages import Message, Program, Snapshot, Welcome
+
+_logger = logging.getLogger("daedalus.launch.camera_process")
+
+
+class CheckpointValues:
+    """Estimates of one run, as far as torch is installed and there is a checkpoint."""
+
+    def __init__(self, directory: Path, modules: UserModules) -> None:
+        self._directory, self._modules = directory, modules
+        self._loaded: Path | None = None
+        self._estimate = _unknown
+
+    def refresh(self) -> None:
+        """Use the newest checkpoint from now on. What cannot be read leaves the estimates as they are."""
+        newest = next(iter(checkpoints(self._directory)), None)
+        if newest is None or newest == self._loaded:
+            return
+        try:
+            from daedalus.policy.acting.value_estimator import ValueEstimator  # imports torch
+
+            self._estimate = ValueEstimator(read_policy(newest), self._modules)
+        except ImportError:
+            _logger.debug("there are no value estimates without torch")
+        except (DamagedError, PolicyError, OSError) as error:  # such as a checkpoint that was pruned meanwhile
+            _logger.debug("no value estimates: %s", error)
+        self._loaded = newest
+
+    def __call__(self, observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
+        """Return the value of one observation; None if it is not known. See ValueEstimator."""
+        return self._estimate(observations, state)
+
+
+def _unknown(observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
+    return None
+
+
+FRAMES_PER_SECOND = 15.0
+_LONGEST_SECONDS = 1.0  # for one frame, for somebody who waits
+_NICENESS = 19
+_READ_BYTES = 1 << 20
+_BETWEEN_EPISODES_SECONDS = 0.7
+
+
+class _Input:
+    """What the gateway sends, read on a thread of its own."""
+
+    def __init__(self, descriptor: int, stop: threading.Event) -> None:
+        self._descriptor, self._stop = descriptor, stop  # not a buffered stream, whose lock the thread would hold
+        self.newest: Snapshot | None = None
+
+    def begin(self) -> tuple[Welcome, Program]:
+        """Return the first two messages, and read the snapshots from then on. Raises EOFError or ProtocolError."""
+        welcome, program = self._read(), self._read()
+        if not isinstance(welcome, Welcome) or not isinstance(program, Program):
+            raise ProtocolError("the first messages are no Welcome and Program")
+        self._keep()
+        threading.Thread(target=self._follow, name="input", daemon=True).start()
+        return welcome, program
+
+    def _follow(self) -> None:
+        try:
+            while True:
+                self._keep()
+        except EOFError:
+            self._stop.set()
+
+    def _keep(self) -> None:
+        message = self._read()
+        if isinstance(message, Snapshot):
+            self.newest = message
+
+    def _read(self) -> Message:
+        (length,) = LENGTH.unpack(self._exactly(LENGTH.size))
+        if length > LEARNER_LIMITS.message_bytes:
+            raise ProtocolError(f"a message of {length} bytes")
+        return decode(self._exactly(length), LEARNER_LIMITS)
+
+    def _exactly(self, length: int) -> bytes:
+        data = bytearray()
+        while len(data) < length:
+            part = os.read(self._descriptor, min(length - len(data), _READ_BYTES))
+            if not part:
+                raise EOFError
+            data += part
+        return bytes(data)
+
+
+class _Output:
+    """Frames to the gateway, at most FRAMES_PER_SECOND; of slower environments at their own speed."""
+
+    def __init__(self, stream: BinaryIO, stop: threading.Event) -> None:
+        self._stream, self._stop, self._due = stream, stop, time.monotonic()
+
+    def show(self, moment: Moment, version: int) -> None:
+        """Write a frame when it is due."""
+        facts = {"version": version, "step": moment.step, "reward": moment.reward, "total": moment.total}
+        facts |= {"value": moment.value}
+        self._stop.wait(max(self._due - time.monotonic(), 0.0))
+        seconds = min(max(moment.seconds, 1.0 / FRAMES_PER_SECOND), _LONGEST_SECONDS)
+        self._due = max(self._due + seconds, time.monotonic())
+        self.write(frame({**facts, "actions": moment.actions}, jpeg(moment.picture)))
+
+    def write(self, data: bytes) -> None:
+        """Write a frame now."""
+        self._stream.write(LENGTH.pack(len(data)) + data)
+        self._stream.flush()
+
+
+def main(output: BinaryIO) -> int:
+    """Play until the gateway closes standard input, and return the exit status."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--allow-module", action="append", default=[])
+    options.add_argument("--checkpoints", type=Path, help="run directory, for value estimates")
+    arguments = options.parse_args()
+    if arguments.checkpoints is not None:  # the environment may change the working directory
+        arguments.checkpoints = Path(os.path.abspath(arguments.checkpoints))
+    configure_logging("warning", as_json=False, process="camera")
+    os.nice(_NICENESS)
+    stop = stop_on_signals(exit_if_stuck=True)
+    frames = _Output(output, stop)
+    try:
+        modules = UserModules(frozenset(arguments.allow_module), "the run")
+        _film(_Input(sys.stdin.fileno(), stop), frames, modules, arguments.checkpoints, stop)
+    except EOFError:
+        return 0
+    except ImportError:
+        frames.write(note('The camera needs Pillow: pip install "daedalus-rl[gateway]" on the host of the gateway.'))
+        return 1
+    except (EnvironmentSetupError, PolicyError, ProtocolError) as error:
+        if not stop.is_set():
+            frames.write(note(f"The camera cannot play: {error}"))
+        return 1
+    except Exception as error:  # of an environment's own renderer, such as OpenGL without a driver
+        frames.write(note(f"The camera cannot play: {type(error).__name__}: {first_line(error)}"))
+        raise
+    return 0
+
+
+def _film(
+    given: _Input, frames: _Output, modules: UserModules, checkpoints: Path | None, stop: threading.Event
+) -> None:
+    welcome, program = given.begin()
+    runtime = OnnxRuntime(program.model.tobytes(), stop)
+    is_its_directory = checkpoints is not None and run_name(checkpoints) == welcome.run
+    values = CheckpointValues(checkpoints, modules) if checkpoints is not None and is_its_directory else None
+    camera = EpisodeCamera(welcome.spec, modules) if values is None else EpisodeCamera(welcome.spec, modules, values)
+    try:
+        while not stop.is_set():
+            snapshot = given.newest
+            assert snapshot is not None
+            runtime.load(snapshot.weights)
+            if values is not None:
+                values.refresh()
+            for moment in camera.play(runtime):
+                frames.show(moment, snapshot.policy_version)
+                if stop.is_set():
+                    return
+            stop.wait(_BETWEEN_EPISODES_SECONDS)
+    finally:
+        camera.close()
+
+
+def _reserved_stdout() -> BinaryIO:
+    """Return standard output for frames alone: what an environment prints goes to standard error."""
+    reserved = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return reserved
+
+
+if __name__ == "__main__":
+    exit_on_thread_exceptions(plays=True)
+    sys.exit(exit_status(lambda: main(_reserved_stdout())))

@@ -1,0 +1,359 @@
+"""A check of an environment in a process of its own: the environment may print, hang, or end its process."""
+
+import faulthandler
+import json
+import logging
+import math
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from daedalus.launch.process_lifecycle import interrupts_held
+from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+
+if TYPE_CHECKING:
+    from daedalus.actor.checking.check_report import EnvironmentReport
+
+_POLL_SECONDS = 0.2
+_ALARM_SECONDS = 5  # after the limit: a process without its parent ends then, even in native code
+
+
+class CheckTimeoutError(Exception):
+    """Error of a check that did not end in time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnvironmentCheck:
+    """What to check, and how long. See check_environment."""
+
+    spec: EnvironmentSpec
+    modules: UserModules
+    seconds: float
+    env_steps: int
+    seed: int = 0
+    most_seconds: float  # for the whole check
+    shown: bool = False  # show what the environment prints, on standard error, and the end of one that crashes
+    notes: bool = False  # add what gymnasium's own checker says
+
+    def run(self) -> "EnvironmentReport":
+        """Check the environment in this process."""
+        from daedalus.actor.checking.checker import gymnasium_notes
+        from daedalus.actor.checking.play import check_environment
+
+        report = check_environment(
+            self.spec, self.modules, seconds=self.seconds, env_steps=self.env_steps, seed=self.seed
+        )
+        if not self.notes or report.problems:
+            return report
+        return report.model_copy(update={"notes": gymnasium_notes(self.spec, self.modules)})
+
+    def words(self) -> str:
+        """Return the check as text, for `from_words` in another process."""
+        plain = {
+            name: getattr(self, name) for name in ("seconds", "env_steps", "seed", "most_seconds", "shown", "notes")
+        }
+        return json.dumps({**plain, "spec": self.spec.model_dump(mode="json"), "modules": sorted(self.modules.allowed)})
+
+    @classmethod
+    def from_words(cls, words: str) -> "EnvironmentCheck":
+        """Return the check of `words`."""
+        values: dict[str, Any] = json.loads(words)
+        spec = EnvironmentSpec.model_validate(values.pop("spec"))
+        return cls(**values | {"spec": spec, "modules": UserModules(frozenset(values["modules"]))})
+
+
+def check_in_process(
+    check: EnvironmentCheck,
+    *,
+    fork: bool = False,
+    stop: threading.Event | None = None,
+    slow_seconds: float = math.inf,
+    on_slow: Callable[[], object] = lambda: None,
+) -> "EnvironmentReport":
+    """Run a check in a process of its own, and return what was found. An environment that ends it has a problem.
+
+    Args:
+      check: what to check.
+      fork: start the process by a fork if it is safe, which takes 0.1 s instead of 0.5 s. For commands, whose process
+        has nothing that does not work after a fork. Only for a check that is not shown.
+      stop: ends the check early when it is set.
+      slow_seconds, on_slow: call this function once if the check takes so long.
+
+    Raises CheckTimeoutError.
+    """
+    from daedalus.actor.checking.check_report import EnvironmentReport
+
+    reading, writing = os.pipe()
+    with open(reading, "rb", buffering=0) as results:
+        # Apple's frameworks do not work after a fork.
+        forked = fork and sys.platform == "linux" and threading.active_count() == 1
+        try:
+            pid = _forked(check, writing) if forked else _spawned(check, writing)
+        finally:
+            os.close(writing)
+        try:
+            answer = _read(results.fileno(), stop or threading.Event(), check.most_seconds, slow_seconds, on_slow)
+            if answer:
+                _end(pid, own_group=not check.shown)  # threads of the environment could keep it alive
+        except BaseException:
+            _end(pid, own_group=not check.shown)
+            raise
+        finally:
+            _, status = os.waitpid(pid, 0)
+    if not answer:
+        ended = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"status {os.WEXITSTATUS(status)}"
+        hint = ", as it would end an actor" if check.shown else ": see what it prints with `daedalus check`"
+        return EnvironmentReport(problems=(f"environment {check.spec.id} ended its process ({ended}){hint}",))
+    return EnvironmentReport.model_validate_json(answer)
+
+
+def _read(
+    descriptor: int, stop: threading.Event, seconds: float, slow_seconds: float, on_slow: Callable[[], object]
+) -> bytes:
+    """Read one line, or nothing if the other end closes before. Raises CheckTimeoutError."""
+    data, began = b"", time.monotonic()
+    while not data.endswith(b"\n"):  # not to the end: processes of the environment may hold the descriptor
+        passed = time.monotonic() - began
+        if stop.is_set() or passed > seconds:
+            raise CheckTimeoutError(f"not done within {seconds:g} s")
+        if passed > slow_seconds:
+            slow_seconds = math.inf
+            on_slow()
+        if not select.select([descriptor], [], [], _POLL_SECONDS)[0]:
+            continue
+        part = os.read(descriptor, 1 << 16)
+        if not part:
+            return b""
+        data += part
+    return data
+
+
+def _end(pid: int, *, own_group: bool) -> None:
+    """Kill a check, with the programs that its environment has started: another simulator could not start."""
+    if own_group:
+        with suppress(OSError):  # a fork has not begun, and has none yet
+            os.killpg(pid, signal.SIGKILL)
+    os.kill(pid, signal.SIGKILL)
+
+
+def _forked(check: EnvironmentCheck, writing: int) -> int:
+    """Return the process id of a fork that writes the report to a descriptor."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        os.setpgid(0, 0)  # see _end
+        silent = os.open(os.devnull, os.O_RDWR)
+        for standard in range(3):
+            os.dup2(silent, standard)
+        _report(check, writing)
+    finally:
+        os._exit(1)  # nothing that belongs to the parent may be closed or flushed here
+
+
+def _spawned(check: EnvironmentCheck, writing: int) -> int:
+    """Return the process id of a new interpreter that writes the report to a descriptor."""
+    os.set_inheritable(writing, True)
+    command = [sys.executable, "-P", "-m", "daedalus.launch.environment_check", str(writing), check.words()]
+    silent = [(os.POSIX_SPAWN_OPEN, standard, os.devnull, os.O_RDWR, 0) for standard in range(3)]
+    shown = [(os.POSIX_SPAWN_DUP2, 2, 1)]  # a debugger of the user reads standard input
+    own_group: dict[str, Any] = {} if check.shown else {"setpgroup": 0}  # see _end
+    with interrupts_held():
+        file_actions = shown if check.shown else silent
+        return os.posix_spawn(sys.executable, command, os.environ, file_actions=file_actions, **own_group)
+
+
+def _report(check: EnvironmentCheck, writing: int) -> None:
+    """Check the environment, and write the report to a descriptor."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # the parent reports Ctrl-C
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    threading.excepthook = threading.__excepthook__  # a fork has the parent's, which ends the process
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(int(check.most_seconds) + _ALARM_SECONDS)
+    if check.shown:
+        faulthandler.enable(all_threads=False)
+    report = check.run()
+    with open(writing, "w", encoding="utf-8") as stream:
+        stream.write(report.model_dump_json() + "\n")
+
+
+_logger = logging.getLogger(__name__)
+
+_PLAY_SECONDS, _PLAY_ENV_STEPS = 0.3, 50
+_MOST_SECONDS = 20.0  # a simulator may need long to start; the run does not wait for it any longer
+_MOST_SECONDS_FOR_SETTINGS = 120.0  # unless its settings depend on the spaces
+
+
+class EnvironmentProblemError(Exception):
+    """Error of an environment that cannot be trained on. The message is one line."""
+
+
+def checked_spaces(spec: RunSpec, *, fork: bool = False) -> Spaces | None:
+    """Check the environment of a run of this machine, log warnings, and return its spaces, or None if it takes long.
+
+    The user has named the modules of the environment. See quick_check. Raises EnvironmentProblemError.
+    """
+    report = _checked(spec, fork)
+    if problem := report.text_problem(spec):
+        raise EnvironmentProblemError(problem)
+    return report.spaces
+
+
+def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | None, dict[str, Any]]:
+    """Check an environment without settings: return its spaces and the default settings for it. See checked_spaces.
+
+    A text that never changes is left out, and logged.
+    """
+    return _defaults(_checked(spec, fork, for_settings=True), spec)
+
+
+def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "EnvironmentReport":
+    from daedalus.actor.checking.check_report import EnvironmentReport, advice, slow_start
+
+    try:
+        modules = UserModules(frozenset(modules_of(spec.user_modules)))
+        report = quick_check(spec.environment, modules, fork=fork, for_settings=for_settings)
+    except CheckTimeoutError as error:
+        hint = slow_start(spec)
+        _logger.warning("the check of the environment was %s: the run starts without it%s", error, hint)
+        return EnvironmentReport()
+    if report.problems:
+        raise EnvironmentProblemError(with_preset(report.problems[0], spec))
+    for warning in report.warnings:
+        _logger.warning("%s", warning)
+    for text in advice(report, spec, os.cpu_count() or 1):
+        _logger.info("%s", text)
+    return report
+
+
+def with_preset(problem: str, spec: RunSpec) -> str:
+    """Return a problem, with a hint if the unknown environment has the name of a preset."""
+    from daedalus.learner.run.settings import preset_names  # which the process of a check does not need
+
+    name = spec.environment.id
+    return f"{problem}; {name!r} is a preset, which is named without --env" if name in preset_names() else problem
+
+
+def transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None, *, fork: bool = False) -> Spaces | None:
+    """Return the spaces after the transforms of `spec`; `spaces` are those with the transforms of `before`.
+
+    Raises EnvironmentProblemError.
+    """
+    if spec.environment == before.environment or spaces is None:
+        return spaces
+    try:
+        modules = UserModules(frozenset(modules_of(spec.user_modules)))
+        report = quick_check(spec.environment, modules, play=False, fork=fork)
+    except CheckTimeoutError:
+        return None
+    if problem := (*report.problems, report.text_problem(spec))[0]:
+        raise EnvironmentProblemError(problem)
+    return report.spaces
+
+
+def expected_spaces(spec: RunSpec, modules: UserModules, stop: threading.Event) -> Spaces | None:
+    """Return the spaces of a run's environment, or None where it cannot be made. Only makes the environment.
+
+    Args:
+      spec: the run.
+      modules: the modules that may be imported.
+      stop: ends the attempt early when it is set.
+    """
+    report = _expected(spec, modules, stop)
+    if problem := report.text_problem(spec):
+        _logger.info("%s", problem)
+        return None
+    return report.spaces
+
+
+def expected_defaults(
+    spec: RunSpec, modules: UserModules, stop: threading.Event
+) -> tuple[Spaces | None, dict[str, Any]]:
+    """Return the spaces of an environment without settings, and the default settings for it. See expected_spaces."""
+    return _defaults(_expected(spec, modules, stop, for_settings=True), spec)
+
+
+def _expected(
+    spec: RunSpec, modules: UserModules, stop: threading.Event, *, for_settings: bool = False
+) -> "EnvironmentReport":
+    from daedalus.actor.checking.check_report import EnvironmentReport
+
+    try:
+        report = quick_check(spec.environment, modules, play=False, stop=stop, for_settings=for_settings)
+    except CheckTimeoutError as error:
+        reason = f"the check of environment {spec.environment.id} was {error}"
+    else:
+        if report.spaces is not None and not report.problems:
+            return report
+        reason = report.problems[0]
+    _logger.info("the first actor decides the spaces of the run, because they are not known here: %s", reason)
+    return EnvironmentReport()
+
+
+def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None, dict[str, Any]]:
+    from daedalus.learner.run.default_settings import default_settings  # which the process of a check does not need
+
+    for name, text in report.constant_texts.items():
+        _logger.info("observation component %r is left out (environment.leave_out): it is always %r", name, text)
+    if report.spaces is None:
+        _logger.warning(
+            "the default settings are those for numbers and discrete actions, because the spaces of environment %s are "
+            "not known: if it has images or continuous actions, name the settings with --set or in a TOML file",
+            spec.environment.id,
+        )
+    return report.spaces, default_settings(report.spaces, [*spec.environment.leave_out, *report.constant_texts])
+
+
+def quick_check(
+    spec: EnvironmentSpec,
+    modules: UserModules,
+    *,
+    play: bool = True,
+    fork: bool = False,
+    stop: threading.Event | None = None,
+    for_settings: bool = False,
+) -> "EnvironmentReport":
+    """Make one environment, play it for up to 0.3 s, close it, and return what was found.
+
+    Args:
+      spec: the environment and its transforms.
+      modules: the modules that may be imported for it.
+      play: False only makes it, for its spaces.
+      fork: start the process by a fork if it is safe, which takes 0.1 s instead of 0.5 s. For commands, whose process
+        has nothing that does not work after a fork.
+      stop: ends the check early when it is set.
+      for_settings: wait longer for a simulator that starts slowly: the settings of the run depend on its spaces.
+
+    Raises CheckTimeoutError.
+    """
+    most_seconds = _MOST_SECONDS_FOR_SETTINGS if for_settings else _MOST_SECONDS
+    waiting = "the check of environment %s takes long: waiting up to %g s, because its spaces decide the settings"
+    return check_in_process(
+        EnvironmentCheck(
+            spec=spec,
+            modules=modules,
+            seconds=_PLAY_SECONDS if play else 0.0,
+            env_steps=_PLAY_ENV_STEPS,
+            most_seconds=most_seconds,
+        ),
+        fork=fork,
+        stop=stop,
+        slow_seconds=_MOST_SECONDS,
+        on_slow=partial(_logger.info, waiting, spec.id, most_seconds),
+    )
+
+
+if __name__ == "__main__":
+    _report(EnvironmentCheck.from_words(sys.argv[2]), int(sys.argv[1]))

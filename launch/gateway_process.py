@@ -1,0 +1,228 @@
+"""The process of `daedalus gateway`: read its certificates and tokens, listen, and serve.
+
+Exit status: 0 stopped by a signal, 1 failed, 2 bad usage.
+"""
+
+import asyncio
+import errno
+import logging
+import os
+import socket
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from daedalus.actor.errors import ActorError
+from daedalus.gateway.security import OperatorToken
+from daedalus.gateway.watching.page_data import OtherRun
+from daedalus.launch.logs import print_error, say
+from daedalus.launch.process_lifecycle import BAD_USAGE
+from daedalus.learner.reporting.metrics_rows import MetricsHistory, read_rows
+from daedalus.learner.run.run_directory import METRICS
+from daedalus.policy.acting.runtime import PolicyError
+from daedalus.policy.user_modules import allow_words
+from daedalus.protocol import keys
+from daedalus.transport.addresses import AddressError, check_listening
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect, load
+from daedalus.transport.interface import TransportError
+from daedalus.transport.retries import Retries
+
+_logger = logging.getLogger(__name__)
+
+LISTEN = "127.0.0.1:8080"
+GATEWAY_PACKAGES = ("starlette", "uvicorn", "websockets")
+INSTALL = 'the gateway needs starlette, uvicorn and websockets: pip install "daedalus-rl[gateway]"'
+MAX_RUNS = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatewayOptions:
+    """What a gateway process was started with."""
+
+    connect: list[str]  # addresses of the learner or of its router
+    run: str = keys.ANY_RUN
+    listen: str = LISTEN
+    or_any_port: bool = False
+    hosts: list[str]  # further names under which clients reach the gateway
+    origins: list[str]  # web sites whose pages may connect
+    tls: Path | None = None  # folders of certificates: of an actor, of the web server, of an operator
+    serve_tls: Path | None = None
+    operator: Path | None = None
+    operator_token: Path | None = None  # file
+    insecure: bool = False
+    compare: list[Path]  # run directories whose curves the page shows
+    camera: bool = True
+    checkpoints: Path | None = None  # run directory, for value estimates of the camera
+    allowed_modules: Sequence[str] = ()
+    takes_clients: bool = True
+    for_a_person: bool = False  # print the address of the page for the person who started the run
+
+
+class OtherRuns:
+    """Readers of run directories that the user named on the command line. One thread at a time."""
+
+    def __init__(self, directories: list[Path]) -> None:
+        """Raise ValueError or OSError if a directory is none of a run, or if there are too many."""
+        if len(directories) > MAX_RUNS:
+            raise ValueError(f"{len(directories)} runs are given with --compare: at most {MAX_RUNS} can be shown")
+        self._known: dict[Path, tuple[int, OtherRun]] = {}  # with the time of the file
+        self._directories = directories
+        for directory in directories:
+            self._read(directory)
+
+    def __call__(self) -> list[OtherRun]:
+        """Return the runs. One whose file cannot be read is as it was."""
+        for directory in self._directories:
+            try:
+                self._read(directory)
+            except (OSError, ValueError) as error:
+                _logger.warning("the run to compare with cannot be read: %s", error)
+        return [self._known[directory][1] for directory in self._directories]
+
+    def _read(self, directory: Path) -> None:
+        path = directory / METRICS
+        if not path.exists():
+            raise ValueError(f"{directory} has no {METRICS}: it is no run directory, or its run has not begun to train")
+        changed = path.stat().st_mtime_ns
+        if directory in self._known and self._known[directory][0] == changed:
+            return
+        history = MetricsHistory()
+        for row in read_rows(path):
+            history.add(row)
+        self._known[directory] = changed, OtherRun(name=directory.resolve().name, rows=history.rows())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Chosen:
+    """What the files that the command line names contain."""
+
+    credentials: Credentials | None
+    operator: Credentials | None
+    serving: Credentials | None
+    operator_token: OperatorToken | None
+    other_runs: OtherRuns
+
+    @classmethod
+    def of(cls, options: GatewayOptions) -> "_Chosen":
+        """Read the files. Raises SECURITY_ERRORS, OSError or ValueError."""
+        if options.operator is not None and options.tls is None:
+            raise ValueError("--operator is for networks with certificates: use --tls too, or leave it out")
+        if options.operator_token is not None and options.serve_tls is not None:
+            raise ValueError("--operator-token is for gateways without --serve-tls: operators have tokens of their own")
+        token = None if options.operator_token is None else OperatorToken(options.operator_token)
+        return cls(
+            credentials=credentials_to_connect(options.connect, options.tls, "actor"),
+            operator=None if options.operator is None else load(options.operator, "operator"),
+            serving=None if options.serve_tls is None else load(options.serve_tls, "gateway"),
+            operator_token=token,
+            other_runs=OtherRuns(options.compare),
+        )
+
+
+def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
+    """Run a gateway until `stop` is set, report why it fails, and return the exit status."""
+    retries = Retries(stop)
+    while True:
+        try:
+            if options.run != keys.ANY_RUN:
+                keys.check_name(options.run, "run")
+            chosen = _Chosen.of(options)
+            host, port = _listening_address(options.listen, chosen.serving is not None, options.insecure)
+            break
+        except NotValidNowError as error:
+            if retries.wait(str(error)):
+                return 0
+        except (ValueError, OSError, *SECURITY_ERRORS) as error:
+            print_error("gateway", error)
+            return BAD_USAGE
+    try:
+        listener = _listen(host, port, options.or_any_port)
+    except OSError as error:
+        reason = (error.strerror or str(error)).partition(" (while attempting")[0]  # of socket.create_server
+        text = f"cannot listen on {options.listen}: {reason}: choose another --listen"
+        print_error("gateway", text)
+        return 1
+    try:
+        asyncio.run(_serve(options, chosen, listener, stop))
+        return 0
+    except (ActorError, PolicyError, TransportError, OSError, ValueError) as error:
+        print_error("gateway", error)
+        return 1
+    except ImportError:
+        print_error("gateway", INSTALL)
+        return 1
+    finally:
+        listener.close()
+
+
+def _camera(options: GatewayOptions) -> tuple[str, ...]:
+    """Return the command of the camera's process."""
+    values = [] if options.checkpoints is None else ["--checkpoints", str(options.checkpoints)]
+    return (
+        sys.executable,
+        "-P",
+        "-m",
+        "daedalus.launch.camera_process",
+        *allow_words(options.allowed_modules),
+        *values,
+    )
+
+
+def _announce(token_file: Path | None) -> Callable[[str], None]:
+    """Return a function that prints the address of the page, for the person who started the run.
+
+    It does not print the token: the output may go to a log that others can read.
+    """
+    token = "" if token_file is None else f" with the token in {os.path.relpath(token_file)}"
+    return lambda address: say(f"watch the run at {address}{token}")
+
+
+async def _serve(options: GatewayOptions, chosen: "_Chosen", listener: socket.socket, stop: threading.Event) -> None:
+    # Imported here, because its packages are an extra.
+    from daedalus.gateway.service import GatewayService, GatewaySettings
+
+    settings = GatewaySettings(
+        connect=options.connect,
+        shown_host=options.listen.rpartition(":")[0],
+        run=options.run,
+        credentials=chosen.credentials,
+        operator=chosen.operator,
+        serving=chosen.serving,
+        hosts=options.hosts,
+        origins=options.origins,
+        operator_token=chosen.operator_token,
+        other_runs=chosen.other_runs,
+        camera=_camera(options) if options.camera else None,
+        takes_clients=options.takes_clients,
+        announce=_announce(options.operator_token) if options.for_a_person else None,
+    )
+    await GatewayService(settings, stop).run(listener)
+
+
+def _listen(host: str, port: int, or_any: bool) -> socket.socket:
+    """Return a listening socket, at another port if the port is taken and any will do. Raises OSError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if not or_any or error.errno != errno.EADDRINUSE:
+            raise
+        return socket.create_server((host, 0), family=family)
+
+
+def _listening_address(listen: str, tls: bool, insecure: bool) -> tuple[str, int]:
+    """Return host and port. Raises AddressError if others could connect without TLS."""
+    host, colon, port = listen.rpartition(":")
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
+        raise AddressError(f"{listen!r} is not an address: write HOST:PORT, such as {LISTEN}")
+    checked = f"{'tls' if tls else 'tcp'}/{host}:{port if int(port) else 1}"  # with 0 the gateway names the one it got
+    try:
+        check_listening([checked], tls=tls, insecure=insecure)
+    except AddressError:
+        raise AddressError(
+            f"{listen} is unencrypted and open to every host that can reach it: use --serve-tls (daedalus certs issue "
+            f"gateway), listen on {LISTEN}, or add --insecure on a network that you trust"
+        ) from None
+    return host.strip("[]"), int(port)

@@ -1,0 +1,237 @@
+"""One run on this machine: training by supervised processes, then the evaluation of the result."""
+
+import logging
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from daedalus.launch.child_output import ChildOutput, OpenStreams, inherited
+from daedalus.launch.confirmation import Confirmations
+from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
+from daedalus.launch.local_run import (
+    LocalRun,
+    RunEnd,
+    RunFailedError,
+    RunStoppedError,
+    UnsavedError,
+    actor_arguments,
+    evaluation_arguments,
+    gateway_arguments,
+    learner_arguments,
+    resume_command,
+)
+from daedalus.launch.process_lifecycle import ORDERED, SUPERSEDED, UNSAVED, UNWRITABLE
+from daedalus.launch.supervision import (
+    GATEWAY,
+    LEARNER_GRACE_SECONDS,
+    FailedError,
+    Supervised,
+    start,
+    stop,
+    supervised_actor,
+    supervised_gateway,
+)
+from daedalus.launch.tracker_processes import TrackerProcesses
+from daedalus.learner.run import run_directory
+from daedalus.learner.run.run_directory import OPERATOR_TOKEN
+from daedalus.learner.serving.events import EventFile
+from daedalus.transport.private_address import private_address
+
+_logger = logging.getLogger(__name__)
+
+FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
+
+_POLL_SECONDS = 0.05
+_EVALUATOR = "evaluator"
+_HELPERS = {_EVALUATOR, GATEWAY}  # processes without which a run goes on
+_SUMMARY_SECONDS = 30.0  # for the learner to write its summary after a callback ended training
+
+
+def train(
+    run: LocalRun,
+    stopping: threading.Event,
+    output: ChildOutput,
+    learner_streams: OpenStreams,
+    page: list[Supervised],
+    trackers: TrackerProcesses,
+) -> int:
+    """Run the learner and the actors; return the learner's exit status. Raises FailedError.
+
+    Adds the gateway to `page`, and starts the trackers. The caller ends them.
+    """
+    with _observed_address(run) as address:
+        spec, options = run.spec, actor_arguments(run)
+        confirmations = Confirmations(run.directory, spec, evaluation_arguments(run), output)
+        learner = _supervised_learner(run, address, learner_streams)
+        actors: list[Supervised] = []
+        try:
+            # One by one: if one cannot be started, those before it are stopped.
+            for index in range(spec.collection.actors):
+                actors.append(supervised_actor(f"actor-{index}", address, options, output.pipes, output.last_error))
+            training = spec.training
+            _logger.info(
+                "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
+                spec.environment.id,
+                training.algorithm,
+                training.seed,
+                len(actors),
+                spec.collection.envs_per_actor,
+                address,
+                run.directory,
+            )
+            if spec.evaluation.seconds is not None:
+                evaluating = (*options, "--evaluator")
+                actors.append(supervised_actor(_EVALUATOR, address, evaluating, output.pipes, output.last_error))
+            # Of a run that was killed, or of whoever has sent this directory: it must not count.
+            (run.directory / OPERATOR_TOKEN).unlink(missing_ok=True)
+            if run.watch:
+                page.append(supervised_gateway(address, gateway_arguments(run), output.pipes))
+            trackers.start()
+            return watch(learner, [*actors, *page], run, stopping, confirmations)
+        finally:
+            learner.process.terminate()
+            stop([*(actor.process for actor in actors), *confirmations.processes])
+            stop([learner.process], LEARNER_GRACE_SECONDS)  # where the disk is slow, it takes longer than the others
+            confirmations.close()
+
+
+@contextmanager
+def _observed_address(run: LocalRun) -> Iterator[str]:
+    """Yield a private address for the learner. The observer of the run follows it there."""
+    with private_address() as address:
+        run.observer.begin(address)
+        try:
+            yield address
+        finally:
+            run.observer.end()
+
+
+def _supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams) -> Supervised:
+    """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
+    descriptors = *run.lock, *run.observer.descriptors
+
+    def begin(first: bool) -> subprocess.Popen[bytes]:
+        arguments = learner_arguments(run, address, first=first)
+        with open_streams("learner") as streams:
+            return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
+
+    return Supervised("the learner", begin, ended=FINISHED | {ORDERED, UNSAVED, SUPERSEDED})
+
+
+def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
+    """End the learner, and wait until it has written its summary, which the evaluation reads."""
+    learner.terminate()
+    deadline = time.monotonic() + _SUMMARY_SECONDS
+    while learner.poll() is None and time.monotonic() < deadline and not stopping.wait(_POLL_SECONDS):
+        pass
+
+
+def watch(
+    learner: Supervised,
+    actors: list[Supervised],
+    run: LocalRun,
+    stopping: threading.Event,
+    confirmations: Confirmations,
+) -> int:
+    """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
+
+    The log shows each restart, and events.jsonl keeps it. Return 0 if the observer ends training, or UNSAVED. Raises
+    FailedError if the learner failed too often, or if too few actors are left; EvaluationFailedError if the result of a
+    confirmation cannot be saved.
+    """
+    record = EventFile(run.directory)
+    while not stopping.wait(_POLL_SECONDS):
+        status = learner.process.poll()
+        if run.observer.poll(learner.process) and status is None:
+            _end(learner.process, stopping)
+            return UNSAVED if learner.process.returncode == UNSAVED else 0
+        if status is not None and (status in learner.ended or learner.failed_at_once):
+            return status
+        _warn(learner.check(), record)
+        confirmations.poll()
+        for actor in list(actors):
+            try:
+                _warn(actor.check(), record)
+            except FailedError as error:
+                actors.remove(actor)
+                stop([actor.process])
+                playing = sum(other.name not in _HELPERS for other in actors)
+                # A synchronous algorithm waits for all actors at its start.
+                needed = not playing or run.spec.algorithm.synchronous
+                if needed and actor.name not in _HELPERS:
+                    _end(learner.process, stopping)
+                    if learner.process.returncode in FINISHED:  # it had all env_steps that it needs
+                        return learner.process.returncode
+                    raise (error if playing else FailedError("all actors", error.reason, "failed")) from None
+                _warn(f"{error}; training continues without this process", record)
+    return 1
+
+
+def _warn(message: str | None, record: EventFile) -> None:
+    if message:
+        _logger.warning("%s", message)
+        record.add_restart(message)
+
+
+def run_locally(
+    run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams = inherited
+) -> RunEnd:
+    """Train until the target or the end of the budget, then evaluate the best checkpoint.
+
+    No child process is left when this returns or raises.
+
+    Args:
+      run: what to run.
+      stopping: ends the run early when it is set.
+      output: reads what the actors and the evaluations write.
+      learner_streams: where the learner writes its log and its progress.
+
+    Raises RunFailedError or RunStoppedError.
+    """
+    page: list[Supervised] = []
+    trackers = TrackerProcesses(run.log, run.directory, output, log_json=run.logs.as_json)
+    try:
+        if run.trained is None:
+            status = train(run, stopping, output, learner_streams, page, trackers)
+        else:
+            trackers.start()
+            status = run.trained
+        if stopping.is_set() or status == ORDERED:
+            raise RunStoppedError
+        if status == UNSAVED:
+            raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
+        if status not in FINISHED:
+            raise RunFailedError(status=status)
+        return RunEnd(status=status, summary=_evaluated(run, stopping, output))
+    except (FailedError, EvaluationFailedError) as error:
+        if stopping.is_set():
+            raise RunStoppedError from None
+        raise RunFailedError(str(error)) from None
+    except KeyboardInterrupt:  # in a function of the public API
+        stopping.set()
+        raise
+    finally:
+        stop([gateway.process for gateway in page])  # until now it has shown the result
+        trackers.finish(stopping)
+        if run.watch:
+            with suppress(OSError):
+                (run.directory / run_directory.OPERATOR_TOKEN).unlink()
+
+
+def _remedy(run: LocalRun) -> str:
+    return f"make room on the disk, or make it writable, then type: {resume_command(run)}"
+
+
+def _evaluated(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
+    """Return the summary with the evaluation. Raises UnsavedError on a full disk, and EvaluationFailedError."""
+    if not (run.directory / run_directory.SUMMARY).exists():  # the learner has said why
+        raise UnsavedError(f"the summary of the run could not be saved: {_remedy(run)}")
+    try:
+        return evaluate_run(run, stopping, output)
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        raise UnsavedError(f"the evaluation could not be saved: {error.strerror}: {_remedy(run)}") from None

@@ -1,0 +1,173 @@
+"""What a user chose to run, and the settings, spaces and directory that a new run gets from it."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from daedalus.launch.environment_check import checked_defaults, checked_spaces, transformed_spaces
+from daedalus.learner.run import run_directory
+from daedalus.learner.run.default_settings import default_settings
+from daedalus.learner.run.resuming import check_initial
+from daedalus.learner.run.run_lock import RunLock
+from daedalus.learner.run.settings import (
+    SettingsError,
+    assign,
+    choose_algorithm,
+    override,
+    preset_names,
+    read_preset,
+    run_spec,
+    unmeasured_target,
+)
+from daedalus.policy.user_code import Surroundings
+from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunChoice:
+    """A preset or an environment, and settings, as a user chose them; None: not chosen."""
+
+    preset: str | None = None
+    env: str | None = None
+    algorithm: str | None = None
+    seed: int | None = None
+    env_steps: int | None = None
+    actors: int | None = None
+    wrap: str | None = None
+    assignments: Sequence[str] = ()  # further settings, each as SECTION.KEY=VALUE
+    settings: Mapping[str, Any] = field(default_factory=dict)  # further settings, by SECTION.KEY
+
+    @property
+    def is_named(self) -> bool:
+        """Whether there is a preset or an environment."""
+        return self.preset is not None or self.env is not None
+
+    def spec(self, defaults: dict[str, Any] | None = None) -> RunSpec:
+        """Return the specification. Raises SettingsError.
+
+        `defaults` are the settings that an environment begins with; None: those for spaces that are not known.
+        """
+        if self.preset is not None and self.env is not None:
+            raise SettingsError(f"leave out one of {self.preset} and --env {self.env}")
+        if self.preset is None and self.env is None:
+            raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
+        if self.preset is not None:
+            return run_spec(self._applied(read_preset(self.preset)))
+        base = default_settings(None) if defaults is None else copy.deepcopy(defaults)
+        with_memory = base.pop("with_memory", {})
+        base.setdefault("environment", {})["id"] = self.env
+        settings = self._applied(copy.deepcopy(base))
+        if settings.get("policy", {}).get("memory", "none") != "none":
+            for section, values in with_memory.items():
+                base.setdefault(section, {}).update(values)
+            settings = self._applied(base)
+        return run_spec(settings)
+
+    def directory(self, spec: RunSpec) -> Path:
+        """Return the default run directory, named after the preset or file, or after the environment.
+
+        A repeated config.toml of another run has no name of its own.
+        """
+        named = self.preset is not None and Path(self.preset).name != run_directory.CONFIG
+        return run_directory.default_directory(Path(self.preset or "").stem if named else spec.environment.id, spec)
+
+    def _applied(self, settings: dict[str, Any]) -> dict[str, Any]:
+        """Return settings after the choices, which change them in place. Raises SettingsError."""
+        changed = copy.deepcopy(settings)
+        if self.algorithm is not None:
+            changed.setdefault("training", {})["algorithm"] = self.algorithm
+        self._change(changed)  # which may choose the algorithm, too
+        choose_algorithm(settings, changed.get("training", {}).get("algorithm"))
+        shortcuts = {
+            ("training", "seed"): self.seed,
+            ("training", "env_steps"): self.env_steps,
+            ("collection", "actors"): self.actors,
+            ("environment", "wrap"): self.wrap,
+        }
+        for (section, key), value in shortcuts.items():
+            if value is not None:
+                settings.setdefault(section, {})[key] = value
+        self._change(settings)
+        if self.env is not None and (chosen := settings["environment"].get("id")) != self.env:
+            raise SettingsError(
+                f"--env {self.env} and environment.id={chosen} are two environments: leave one of them out"
+            )
+        return settings
+
+    def _change(self, settings: dict[str, Any]) -> None:
+        """Apply the further settings, in place."""
+        override(settings, self.assignments)
+        for path, value in self.settings.items():
+            try:
+                assign(settings, path, value)
+            except SettingsError as error:
+                raise SettingsError(f"settings {path!r}: {error}") from None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NewRun:
+    """A run to start, as a user chose it."""
+
+    choice: RunChoice
+    directory: Path | None = None  # None: a new folder in runs/
+    init_from: Path | None = None  # another run, or one of its checkpoints, whose weights to begin with
+    other_spaces: bool = False  # accept `init_from` of other spaces
+
+    def create(self, spec: RunSpec, directory: Path) -> RunLock:
+        """Create the run directory, and return its lock. A default directory that is there gets a number."""
+        return run_directory.create_locked(
+            directory,
+            spec,
+            numbered=self.directory is None,
+            init_from=self.init_from,
+            other_spaces=self.other_spaces,
+        )
+
+
+def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Spaces | None]:
+    """Check the environment of a new run, and create its directory.
+
+    `fork`: see quick_check. Return the lock of the directory, the specification, and the spaces, or None where the
+    check of the environment takes long. Raises SettingsError, EnvironmentProblemError or RunInUseError.
+    """
+    if new.directory is not None:
+        run_directory.check_free(new.directory)  # before the environment is made
+    check_initial(new.init_from, other_spaces=new.other_spaces)
+    with Surroundings():  # which an algorithm of the user may change when it is imported
+        spec, spaces = _prepared(new.choice, fork)
+    return new.create(spec, new.directory or new.choice.directory(spec)), spec, spaces
+
+
+def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
+    spec = choice.spec()
+    if choice.env is None:
+        spaces = checked_spaces(spec, fork=fork)
+    else:
+        spaces, defaults = checked_defaults(spec, fork=fork)
+        chosen = choice.spec(defaults)
+        spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
+    if problem := unmeasured_target(spec):
+        raise SettingsError(problem)
+    return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
+
+
+def with_record(spec: RunSpec, modules: UserModules) -> RunSpec:
+    """Return the specification with the record of its algorithm, if that is the user's own.
+
+    `modules` may be imported. Raises SettingsError.
+    """
+    if not spec.training.user_modules:
+        return spec
+    from daedalus.algorithms.own_algorithm import own_class  # torch, which other runs do not need here
+    from daedalus.protocol.algorithms import AlgorithmError
+
+    settings = spec.model_dump()
+    try:
+        settings["training"]["algorithm_record"] = own_class(spec.training.algorithm, modules).record.model_dump()
+    except AlgorithmError as error:
+        raise SettingsError(str(error)) from None
+    return run_spec(settings)

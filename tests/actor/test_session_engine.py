@@ -1,0 +1,218 @@
+"""The session engine in given time: joining, silence, the link, the choice of snapshots. No test here waits."""
+
+import subprocess
+import sys
+
+import pytest
+from log_lines import LINES
+from played_session import SPEC, PlayedSession, refusal, welcome
+
+from daedalus.actor.errors import ActorRefusedError, NameInUseError, NoLearnerError
+from daedalus.actor.session.actor_config import ActorConfig, LinkChoice
+from daedalus.actor.session.conversation import (
+    Ask,
+    DeclarePresence,
+    Query,
+    Reopen,
+    RunOverError,
+    Subscribe,
+    Unsubscribe,
+)
+from daedalus.actor.session.session_engine import Collect, Load
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Acknowledgement, Join, RunEnded, SnapshotRequest, new_epoch
+
+
+def rollouts(played: PlayedSession) -> list[Query]:
+    return [query for query in played.of(Query) if "/rollouts/" in query.key]
+
+
+def test_engine_has_no_threads_no_clock_and_no_transport() -> None:
+    code = """
+import sys
+import daedalus.actor.session.session_engine as engine
+for name in ("actor_config", "conversation", "session_engine", "snapshots", "uploading"):
+    module = sys.modules["daedalus.actor.session." + name]
+    used = {getattr(value, "__name__", "") for value in vars(module).values()}
+    assert not used & {"threading", "time", "queue", "asyncio", "random", "SessionThread"}, (name, used)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# ----------------------------------------------------------------------------------------------------- joining
+
+
+def test_session_is_reopened_every_five_seconds_without_an_answer() -> None:
+    played = PlayedSession()
+    played.learners.clear()
+    played.go(lambda: len(played.of(Reopen)) == 3)
+    assert 1015.0 < played.now < 1020.0
+    played.learners["r"] = [welcome()]
+    played.go(lambda: bool(rollouts(played)))
+
+
+@pytest.mark.parametrize(("leaves", "seconds"), [(True, 2.0), (False, 5.0)])
+def test_newer_of_two_learners_is_joined_once_the_older_has_left_or_after_five_seconds(
+    leaves: bool, seconds: float
+) -> None:
+    older, newer = welcome(epoch=new_epoch(1)), welcome(epoch=new_epoch(2))
+    played = PlayedSession()
+    played.learners["r"] = [older, newer]
+    if leaves:
+        played.go(lambda: played.now >= 1002.0)
+        played.learners["r"] = [newer]
+    played.go(lambda: bool(played.of(DeclarePresence)))
+    assert played.session.learner_epoch == newer.learner_epoch
+    assert played.now == pytest.approx(1000.0 + seconds, abs=1.1)
+    assert any(line.startswith("2 learners of run 'r' answer") for line in LINES)
+    assert "waiting for the older learner to step down" in LINES
+
+
+def test_name_in_use_is_waited_for() -> None:
+    played = PlayedSession()
+    played.learners["r"] = refusal("name_taken")
+    with pytest.raises(NameInUseError):
+        played.go(lambda: False)
+    assert 1010.0 < played.now < 1012.0
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_time_to_look_for_a_learner(waits: bool) -> None:
+    played = PlayedSession(ActorConfig(name="a", incarnation=7, timeout=30.0, waits_for_return=waits))
+    played.go(lambda: bool(rollouts(played)))
+    played.learners.clear()
+    played.event(played.session.presence_changed, False)
+    began = played.now
+    if waits:
+        played.go(lambda: played.now > began + 100.0)
+        return
+    with pytest.raises(NoLearnerError, match="no learner answered within 30 s"):
+        played.go(lambda: False)
+    assert began + 30.0 < played.now < began + 32.0
+
+
+@pytest.mark.parametrize("any_run", [False, True])
+def test_actor_stays_with_the_run_that_it_joined_first_unless_told_otherwise(any_run: bool) -> None:
+    played = PlayedSession(ActorConfig(name="a", incarnation=7, any_run=any_run))
+    played.learners = {"first": [welcome("first")]}
+    played.go(lambda: bool(rollouts(played)))
+    played.learners = {"other": [welcome("other", epoch=2)]}
+    played.event(played.session.presence_changed, False)
+    if any_run:
+        played.go(lambda: rollouts(played)[-1].key == keys.rollouts("other", "a"))
+        return
+    played.go(lambda: "waiting for a learner of run 'first'; the runs here are 'other'" in LINES)
+    played.learners["first"] = [welcome("first", epoch=3)]
+    played.go(lambda: played.session.learner_epoch == 3)
+
+
+# ----------------------------------------------------------------------------------------- silence and the end
+
+
+def test_silent_learner_is_probed_and_joined_again_if_it_does_not_respond() -> None:
+    played = PlayedSession()
+    played.verdict = None
+    played.go(lambda: len(rollouts(played)) == 2)
+    joins = len(played.requests(Join))
+    played.go(lambda: len(played.requests(Join)) == joins + 3)
+    assert all(join.spaces is None for join in played.requests(Join)[joins:])
+    assert played.now == pytest.approx(1030.0, abs=1.0)  # it answers each probe: it is only slow
+    assert not any("went away" in line for line in LINES)
+    played.learners.clear()
+    played.go(lambda: any("went away" in line for line in LINES))
+    played.learners["r"] = [welcome()]
+    sent = len(rollouts(played))
+    played.go(lambda: len(rollouts(played)) == sent + 2)  # the same again
+    assert len(played.of(Collect)) == 2
+
+
+def test_actor_that_is_drained_while_it_sends_nothing_ends() -> None:
+    """Because it waits for the other actors of a2c."""
+    played = PlayedSession()
+    played.verdict = None
+    played.go(lambda: len(rollouts(played)) == 2)
+    played.learners["r"] = refusal("drained")
+    with pytest.raises(RunOverError, match="an operator drained this actor"):
+        played.go(lambda: False)
+
+
+@pytest.mark.parametrize("verdict", ["quarantined", "finished", "drained"])
+def test_verdict_ends_a_rollout_that_is_being_collected(verdict: str) -> None:
+    played = PlayedSession()
+    played.verdict = None
+    played.go(lambda: len(played.of(Collect)) == 2)
+    answer = encode(Acknowledgement(verdict=verdict, reason="why"))  # type: ignore[arg-type] - one of its literals
+    played.event(rollouts(played)[0].on_answer, answer, played.now)
+    with pytest.raises(ActorRefusedError if verdict == "quarantined" else RunOverError):
+        played.session.check_over()
+
+
+@pytest.mark.parametrize(("starts", "is_over"), [(1, False), (2, True), (3, True)])
+def test_only_an_older_learner_cannot_say_that_the_run_is_over(starts: int, is_over: bool) -> None:
+    """Two processes that resumed from the same checkpoint differ in random bits only: either may end the run."""
+    played = PlayedSession()
+    played.learners["r"] = [welcome(epoch=new_epoch(2))]
+    played.go(lambda: bool(rollouts(played)))
+    ended = RunEnded(learner_epoch=new_epoch(starts), outcome="finished", reason="solved")
+    played.event(played.session.received, keys.run_end("r"), encode(ended))
+    if is_over:
+        with pytest.raises(RunOverError, match="the run is over: solved"):
+            played.go(lambda: False)
+    else:
+        sent = len(rollouts(played))
+        played.go(lambda: len(rollouts(played)) > sent + 3)
+
+
+# -------------------------------------------------------------------------------------------------- snapshots
+
+
+def test_actor_on_a_slow_link_subscribes_to_no_snapshots() -> None:
+    played = PlayedSession()
+    played.seconds[Ask] = 0.3
+    played.go(lambda: bool(rollouts(played)))
+    assert any(line.startswith("slow link: ") for line in LINES)
+    assert played.of(Subscribe) == [Subscribe(keys.run_end("r"))]
+    assert all(request.compact for request in played.requests(SnapshotRequest))
+
+
+def test_snapshots_are_pushed_until_the_first_has_come_and_fetched_then() -> None:
+    played = PlayedSession()
+    played.go(lambda: len(rollouts(played)) > 20)
+    requests = played.requests(SnapshotRequest)
+    assert requests
+    assert not any(request.compact for request in requests)
+    assert not played.of(Unsubscribe)  # the program and the first snapshot were there at once
+
+
+@pytest.mark.parametrize(
+    ("seconds", "weights", "link", "fetches_differences"),
+    [(1.0, 8, "auto", True), (0.1, 8, "auto", False), (1.0, 1 << 20, "auto", False), (1.0, 8, "lan", False)],
+    ids=["slow rollouts", "fast rollouts", "a large network", "if told otherwise"],
+)
+def test_differences_are_fetched_after_three_slow_rollouts_with_a_small_network(
+    seconds: float, weights: int, link: LinkChoice, fetches_differences: bool
+) -> None:
+    played = PlayedSession(ActorConfig(name="a", incarnation=7, link=link), weights=weights)
+    played.seconds[Collect] = seconds
+    for version in range(1, 12):
+        played.version = version
+        sent = len(rollouts(played))
+        played.go(lambda sent=sent: len(rollouts(played)) > sent)
+    compact = [request.compact for request in played.requests(SnapshotRequest)]
+    assert any(compact) == fetches_differences
+    assert not any(compact[:3])
+    loaded = [load.snapshot.policy_version for load in played.of(Load) if load.snapshot is not None]
+    assert loaded == sorted(loaded)
+    assert loaded[-1] >= 9  # as promptly as whole ones
+
+
+def test_synchronous_actor_plays_each_version_once() -> None:
+    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
+    played = PlayedSession()
+    played.learners["r"] = [welcome(spec=spec)]
+    played.go(lambda: len(rollouts(played)) == 1)
+    began = played.now
+    played.version = 1
+    played.go(lambda: len(rollouts(played)) == 2)  # its push was lost: it is requested after a second
+    assert played.now == pytest.approx(began + 1.0, abs=0.1)
