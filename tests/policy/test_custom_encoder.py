@@ -39,19 +39,15 @@ Building = Callable[..., ActorCritic]
 
 
 @pytest.fixture
-def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Building]:
+def build(tmp_path: Path) -> Building:
     """Return a function that builds the network with class `Net` of a source, a module in the working directory."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
     def from_source(source: str, where: Spaces = SPACES, **policy: Any) -> ActorCritic:
         (tmp_path / "users_own.py").write_text(PREAMBLE + source)
         spec = PolicySpec(encoder="users_own:Net", **policy)
         return ActorCritic(spec, where, UserModules(frozenset({"users_own"})))
 
-    yield from_source
-    sys.modules.pop("users_own", None)
+    return from_source
 
 
 def test_class_in_the_working_directory_is_imported_and_exported(build: Building) -> None:
@@ -304,11 +300,15 @@ def test_encoder_that_cannot_be_exported_is_rejected(build: Building, returned: 
 
 
 @pytest.fixture(autouse=True)
-def _restored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def _restored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(sys, "modules", {**sys.modules})
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    before = {**sys.modules}
+    yield
+    for name in sys.modules.keys() - before.keys():  # of the test's own: parts of torch imported late must stay
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
 
 
 def test_an_allowed_module_is_imported_from_the_working_directory(tmp_path: Path) -> None:
