@@ -4,7 +4,7 @@
 
 CartPole with the default settings and two honest actors. Early in the run a third one sends one rollout with
 observations of +-9e14, one with rewards of +-1e9, or 700 of the first kind, rejoining when it is quarantined; or, for
-half of the run, values a thousand times too large, which no quarantine ends. The run must reach 95 % of the return that
+half of the run, values a thousand times too large, which no quarantine ends. The run must reach 90 % of the return that
 it has without an attack. `make attack` does all of it in one run; the command above does each in a run of its own.
 """
 
@@ -21,7 +21,7 @@ from benchmarks.chaos.scene import Scene, read_json, scene
 
 _ENV_STEPS = 100_000
 _BEGIN, _END = 5_000, 50_000  # env_steps of the run, between which it is attacked
-_RETURN = 475.0  # 95 % of 500, the largest of CartPole, which the run has without an attack
+_RETURN = 450.0  # 90 % of 500, the largest of CartPole: without an attack the newest 100 episodes have 460 to 500
 _MESSAGES = 700
 
 
