@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from certificates import make_certificates
 from lucky_environment import BUSY, UNLUCKY, WAITING
 from processes import Running, free_address, processes_mentioning, until
 
@@ -62,13 +63,15 @@ def test_training_continues_until_new_episodes_confirm_the_target(
 
 
 def test_a_learner_without_launcher_confirms_its_target_too(start: Start, tmp_path: Path) -> None:
-    """It is alone with what actors report."""
+    """It is alone with what actors report, and its evaluator has no certificate for the router."""
     shutil.copy(Path(__file__).parent.parent / "lucky_environment.py", tmp_path)
     (tmp_path / UNLUCKY).touch()
-    address = free_address()
-    words = ("--env", "lucky_environment:Lucky-v0", "--listen", address, "--run-dir", "run", *WORDS)
-    learner = start("learner", *words)
-    start("actor", "--connect", address, "--allow-module", "lucky_environment")
+    certificates, address = make_certificates(tmp_path / "certs"), free_address().replace("tcp/", "tls/")
+    start("router", "--listen", address, "--tls", certificates / "router")
+    connect = ("--connect", address, "--tls")
+    words = (*connect, certificates / "learner", "--run-dir", "run", *WORDS)
+    learner = start("learner", "--env", "lucky_environment:Lucky-v0", *words)
+    start("actor", *connect, certificates / "actor-arm", "--allow-module", "lucky_environment")
     learner.expect("not confirmed: return 0; training continues")
     assert learner.wait() == 0, learner.output
     assert summary(tmp_path)["confirmation_return_mean"] == 1.0
