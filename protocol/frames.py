@@ -27,18 +27,19 @@ class FrameStack:
         """Observations of the policy [E, *stacked_shape]; a view, valid until the next `push`."""
         return self._frames[:, 0] if self._depth == 1 else self._frames
 
-    def push(self, frames: np.ndarray, starts: np.ndarray) -> None:
+    def push(self, frames: np.ndarray, starts: np.ndarray, where: np.ndarray | slice = slice(None)) -> None:
         """Add the next frame of each environment.
 
         Args:
           frames: [E, *frame_shape].
           starts: [E] bool, whether an episode starts with the frame.
+          where: [E] bool, the environments that have a next frame, if not all.
         """
         if self._depth == 1:
-            self._frames[:, 0] = frames
+            self._frames[where, 0] = frames[where]
             return
-        self._frames[:, :-1] = self._frames[:, 1:]
-        self._frames[:, -1] = frames
+        self._frames[where, :-1] = self._frames[where, 1:]
+        self._frames[where, -1] = frames[where]
         for environment in np.flatnonzero(starts):
             self._frames[environment] = frames[environment]
 
@@ -59,10 +60,10 @@ class ObservationStacks:
         """Observations of the policy, each [E, *stacked_shape]; views, valid until the next `push`."""
         return {name: stack.observations for name, stack in self._stacks.items()}
 
-    def push(self, frames: dict[str, np.ndarray], starts: np.ndarray) -> None:
+    def push(self, frames: dict[str, np.ndarray], starts: np.ndarray, where: np.ndarray | slice = slice(None)) -> None:
         """Add the next frame of each component and environment; arguments as for FrameStack."""
         for name, stack in self._stacks.items():
-            stack.push(frames[name], starts)
+            stack.push(frames[name], starts, where)
 
 
 def stack_rows(frames: np.ndarray, valid: np.ndarray, out: np.ndarray) -> None:

@@ -8,7 +8,7 @@ file, the command line) or how it is used.
 
 import math
 import re
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgpack
 from pydantic import AfterValidator, Field, JsonValue, ValidationError, model_validator
@@ -26,7 +26,8 @@ from daedalus.protocol.models import (
 from daedalus.protocol.spaces import ComponentName
 from daedalus.protocol.texts import bounded_text
 
-Backend = Literal["gymnasium", "envpool", "ale", "fast"]
+Backend = Literal["gymnasium", "envpool", "ale", "fast", "pettingzoo"]
+GAME_PACKAGES = ("pettingzoo", "mpe2")  # whose modules are games with several agents
 FrameStackSize = Annotated[int, Field(ge=1, le=16)]
 _OBJECT = r"\w+(\.\w+)*:\w+"  # module:name
 _Part = TypeVar("_Part", bound=Specification)
@@ -49,9 +50,15 @@ class EnvironmentSpec(Specification):
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_check_environment_id)]
-    """Environment to play: a gymnasium id, `module:Id` for your own, or the backend's own name."""
+    """Environment to play: a gymnasium id, `module:Id` for your own, or the backend's own name. A game with several
+    agents: its module, such as `pettingzoo.classic.connect_four_v3`, or `module:function` for your own."""
     backend: Backend = "gymnasium"
-    """Implementation of the environment. `fast` is gymnasium's CarRacing-v3 with a cheaper renderer."""
+    """Implementation of the environment. `fast` is gymnasium's CarRacing-v3 with a cheaper renderer; `pettingzoo` plays
+    games with several agents, and is chosen for its modules."""
+    agents: Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(max_length=1024)] = ()
+    """Agents of a game that the policy plays; others take random actions. Unset: all, if their spaces are the same."""
+    agent_ids: bool = False
+    """Let the policy observe which agent of a game it plays, as a component `agent`."""
     kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """Further arguments of the environment's constructor."""
     training_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
@@ -92,6 +99,31 @@ class EnvironmentSpec(Specification):
     """Multiply the rewards that learning uses by this value."""
     bootstrap_terminations: bool = False
     """Bootstrap at the environment's terminations as if they were truncations."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose_backend(cls, values: Any) -> Any:
+        if isinstance(values, dict) and "backend" not in values:
+            name = values.get("id")
+            if isinstance(name, str) and name.startswith(tuple(f"{package}." for package in GAME_PACKAGES)):
+                return {**values, "backend": "pettingzoo"}
+        return values
+
+    @model_validator(mode="after")
+    def _games_have_no_wrappers(self) -> "EnvironmentSpec":
+        names = ("agents", "agent_ids")
+        if self.is_game:
+            names = ("wrap", "processes", "max_episode_steps", "action_repeat", "no_reward_limit")
+        for name in names:
+            if getattr(self, name) != type(self).model_fields[name].default:
+                kind = "is for games with several agents" if not self.is_game else "does not apply to games"
+                raise ValueError(f"environment.{name} {kind} (environment.backend=pettingzoo): leave it unset")
+        return self
+
+    @property
+    def is_game(self) -> bool:
+        """Whether several agents may play in one environment, each with rows of its own."""
+        return self.backend == "pettingzoo"
 
     @property
     def constructor_kwargs(self) -> dict[str, JsonValue]:
@@ -486,6 +518,15 @@ class RunSpec(Specification):
             raise ValueError(
                 f"collection.upload is gradients, but {self.training.algorithm} {kind} a batch, which only the learner "
                 "can do: use a3c, a2c or n_step_q, or set collection.upload=rollouts"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _games_send_rollouts(self) -> "RunSpec":
+        if self.uploads_gradients and self.environment.is_game:
+            raise ValueError(
+                "collection.upload is gradients, but a gradient does not tell the env_steps of a game with several "
+                "agents: set collection.upload=rollouts"
             )
         return self
 

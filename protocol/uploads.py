@@ -76,6 +76,7 @@ class Rollout:
     # By name [n] float64, or float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
+    game_steps: int | None = None  # env_steps of a game with several agents, at most its rows to learn from
 
     @property
     def nbytes(self) -> int:
@@ -104,6 +105,10 @@ class Rollout:
                 raise ValueError(f"{name} must be [{rows}, {environments}] like rewards, not {array.shape}")
         self._check_dtypes()
         _check_episodes(self)
+        if self.game_steps is not None and not 0 <= self.game_steps <= self.agent_steps:
+            raise ValueError(
+                f"game_steps is {self.game_steps}, of a rollout with {self.agent_steps} rows to learn from"
+            )
         if len(self.episode_returns) > rows * environments:
             raise ValueError("more episodes ended than the rollout has rows")
 
@@ -140,9 +145,14 @@ class Rollout:
         return self.valid if self.overridden is None else self.valid & ~self.overridden
 
     @property
-    def env_steps(self) -> int:
-        """Number of rows to learn from, over all environments."""
+    def agent_steps(self) -> int:
+        """Number of rows to learn from, over all environments or seats."""
         return int(np.count_nonzero(self.learned))
+
+    @property
+    def env_steps(self) -> int:
+        """Steps of the environments: the rows to learn from, unless several agents act in one step of a game."""
+        return self.agent_steps if self.game_steps is None else self.game_steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -190,6 +200,11 @@ class Gradient:
             if values.dtype != np.int64 or values.ndim != 1:
                 raise ValueError(f"action_counts/{name} must be int64 [choices], not {values.dtype} {values.shape}")
         _check_episodes(self)
+
+    @property
+    def agent_steps(self) -> int:
+        """Number of rows to learn from of its rollout: no game has gradients."""
+        return self.env_steps
 
     @property
     def norm(self) -> float:

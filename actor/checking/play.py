@@ -13,6 +13,7 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from daedalus.actor.checking.check_report import EnvironmentReport
 from daedalus.actor.checking.checker import RandomActions, Texts
+from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
     learned_reward_violations,
@@ -204,6 +205,8 @@ def check_environment(
       env_steps: the most steps.
       seed: of the environment and the actions.
     """
+    if spec.is_game:
+        return check_game(spec, modules, seconds=seconds, env_steps=env_steps, seed=seed)
     report = _check_one(spec, modules, seconds, env_steps, seed)
     if report.problems or report.spaces is None or seconds == 0.0:
         return report

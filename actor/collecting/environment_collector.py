@@ -1,10 +1,11 @@
 """Rollouts from environments that the actor creates and steps itself. No network, no threads."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.collecting.rollout_writer import RolloutWriter, SeatWriter
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
@@ -54,7 +55,8 @@ class EnvironmentCollector:
         assert environments is not None
         environment_seed, *action_seed = np.random.SeedSequence(seed).generate_state(4).tolist()  # of 32 bits each
         self._runtime = runtime
-        self._writer = RolloutWriter(
+        writer = partial(SeatWriter, seats=environments.seats) if spec.environment.is_game else RolloutWriter
+        self._writer = writer(
             environments.spaces,
             environments.count,
             runtime,

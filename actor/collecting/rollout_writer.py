@@ -1,10 +1,12 @@
 """Rollouts, written row by row: actions from a policy, outcomes from the caller. No network, no threads."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+import logging
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.vector_environments import Observed
 from daedalus.policy.acting.noise import Noise, draw_noise
 from daedalus.policy.acting.program_check import PolicyError
@@ -13,6 +15,10 @@ from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
+
+_MOST_SKIPPED = 100  # rows of a rollout that are played and not written, for each that is
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +47,18 @@ class EpisodeCounter:
             self._finished.append((self._returns[self.ended], self._lengths[self.ended]))
             self._returns[self.ended] = 0.0
             self._lengths[self.ended] = 0
+
+    def step_seats(self, acted: np.ndarray, rewards: np.ndarray, ended: np.ndarray, reported: np.ndarray) -> None:
+        """Count a step of the seats that `acted`; of those whose episode `ended`, give the `reported` ones; all [E]."""
+        valid = acted & ~self.ended
+        self._returns[valid] += rewards[valid]
+        self._lengths += valid
+        ended = valid & ended
+        if np.count_nonzero(ended):
+            self._finished.append((self._returns[ended & reported], self._lengths[ended & reported]))
+            self._returns[ended] = 0.0
+            self._lengths[ended] = 0
+        self.ended = np.where(acted, ended, self.ended)
 
     def cut(self) -> None:
         """Note that all episodes ended with the row that was counted last."""
@@ -260,6 +278,125 @@ class RolloutWriter:
             episode_lengths=finished.lengths,
             episode_info=episode_info or {},
             overridden=self._overridden if self._overridden.any() else None,
+        )
+
+
+class SeatWriter(RolloutWriter):
+    """A RolloutWriter of the seats of games, each with rows of its own: see Observed.acting.
+
+    A row goes from an action of the seat to its next observation, however many steps of the game that takes. A seat
+    whose rows are full plays on without them until those of all seats are full.
+    """
+
+    def __init__(self, *arguments: Any, seats: int, **options: Any) -> None:
+        """`seats` is the number of seats of each game; for the others see RolloutWriter."""
+        super().__init__(*arguments, **options)
+        self._seats = seats
+        self._rows = np.zeros(self._count, np.int64)  # [E] that are written
+        self._begun = np.zeros(self._count, np.bool_)  # [E] whether the seat has had an observation
+        self._acting = np.zeros(self._count, np.bool_)
+        self._writing = np.zeros(self._count, np.bool_)  # [E] whether the row that the seat has begun is written
+        self._next_state = np.zeros_like(self._state)
+        self._chosen = {name: np.zeros_like(actions[0]) for name, actions in self._actions.items()}
+        self._env_steps = self._skipped = 0  # of this rollout; rows that were not written
+        self._warned = False
+
+    def start(self, observed: Observed) -> None:
+        """See RolloutWriter."""
+        self._show(observed)
+
+    def act(self) -> dict[str, np.ndarray]:
+        """See RolloutWriter. Only those of the acting seats have an effect."""
+        super().act()
+        return self._chosen
+
+    def begin_row(self) -> RowInputs:
+        """See RolloutWriter. The inputs are those of the acting seats."""
+        acting = self._acting
+        writing = acting & (self._rows < len(self._rewards))
+        first = writing & (self._rows == 0)
+        if np.count_nonzero(first):
+            for name, frames in self._stacks.frames.items():
+                self._frames[name][: self._depths[name], first] = frames[first].swapaxes(0, 1)
+            self._initial_state[first] = self._state[first]
+        self._writing[acting] = writing[acting]
+        valid = writing & ~self._episodes.ended
+        self._env_steps += np.count_nonzero(valid.reshape(-1, self._seats).any(axis=1))
+        self._skipped += np.count_nonzero(acting & ~writing)
+        self._refuse_absent_seats()
+        return RowInputs(
+            {name: values[acting] for name, values in self._stacks.observations.items()},
+            self._state[acting],
+            {name: masks[acting] for name, masks in self._current_masks.items()},
+            self._epsilon[acting],
+            draw_noise(self._runtime.noise_size, int(np.count_nonzero(acting)), self._random),
+        )
+
+    def take_choice(self, choice: Choice) -> None:
+        """See RolloutWriter."""
+        columns = np.flatnonzero(self._writing & self._acting)
+        rows, chosen = self._rows[columns], self._writing[self._acting]  # of the choices: those that are written
+        self._log_probs[rows, columns] = choice.log_probs[chosen]
+        self._next_state[self._acting] = choice.state
+        for name, actions in self._actions.items():
+            actions[rows, columns] = choice.actions[name][chosen]
+            self._chosen[name][self._acting] = choice.actions[name]
+        for name, masks in self._masks.items():
+            masks[rows, columns] = self._current_masks[name][columns]
+
+    def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
+        """See RolloutWriter."""
+        assert observed.acting is not None
+        acted = observed.acting & self._begun  # seats whose action has an outcome
+        columns = np.flatnonzero(acted & self._writing)
+        rows, resets = self._rows[columns], self._episodes.ended
+        for name, frames in self._frames.items():
+            frames[self._depths[name] + rows, columns] = observed.frames[name][columns]
+        self._rewards[rows, columns] = rewards[columns]
+        self._terminated[rows, columns] = terminated[columns]
+        self._truncated[rows, columns] = truncated[columns]
+        self._valid[rows, columns] = ~resets[columns]
+        self._rows[columns] += 1
+        if self._state.size:
+            goes_on = ~resets & np.isfinite(self._next_state).all(axis=1)
+            self._state[acted] = np.where(goes_on[:, None], self._next_state, np.float32(0.0))[acted]
+        self._show(observed)
+        written = acted & self._writing
+        self._episodes.step_seats(acted, rewards.astype(np.float32), terminated | truncated, written)
+        self._writing[acted] = False
+        return bool((self._rows == len(self._rewards)).all())
+
+    def finish(
+        self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None
+    ) -> Rollout:
+        """See RolloutWriter."""
+        rollout = super().finish(identity, policy_version, episode_info)
+        if not self._warned and self._skipped > self._rewards.size:
+            self._warned = True
+            _logger.warning(
+                "more than half of the agents' steps are not learned from, for some agents act much more often than "
+                "others: each has as many rows in a rollout (environment.agents chooses the agents)"
+            )
+        rollout = replace(rollout, game_steps=self._env_steps)
+        self._rows[:] = 0
+        self._env_steps = self._skipped = 0
+        return rollout
+
+    def _show(self, observed: Observed) -> None:
+        """Take what the seats show after a reset or a step."""
+        assert observed.acting is not None
+        starts = observed.acting & (self._episodes.ended | ~self._begun)
+        self._stacks.push(observed.frames, starts, observed.acting)
+        self._current_masks, self._acting = observed.masks, observed.acting
+        self._begun |= observed.acting
+
+    def _refuse_absent_seats(self) -> None:
+        if self._skipped <= _MOST_SKIPPED * self._rewards.size:
+            return
+        seat = int(np.argmin(self._rows)) % self._seats
+        raise EnvironmentSetupError(
+            f"agent number {seat} of the game hardly ever acts: the others took {self._skipped:,} steps that are not "
+            "learned from, while its rows of one rollout were not full; leave it out with environment.agents"
         )
 
 

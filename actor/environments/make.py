@@ -66,6 +66,10 @@ def make_bare(
             from daedalus.actor.environments.envpool_backend import make_envpool
 
             return make_envpool(spec, count)
+        case "pettingzoo":
+            from daedalus.actor.environments.games import make_games
+
+            return make_games(spec, count, modules), spec
         case "ale":
             from daedalus.actor.environments.atari import make_ale
 

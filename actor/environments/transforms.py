@@ -17,6 +17,7 @@ from daedalus.actor.environments.components import (
     without,
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
+from daedalus.actor.environments.games import GameEnvironments
 from daedalus.actor.environments.info import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed, Step
@@ -140,6 +141,7 @@ class TransformedEnvironment:
         For `one_episode` see make_environments.
         """
         self._environments = environments
+        self._games = environments if isinstance(environments, GameEnvironments) else None
         self._name, self._one_episode = spec.id, one_episode
         self._ended = np.zeros(environments.count, np.bool_)  # [E] whether the next step only resets
         self._warned_of_rewards = False
@@ -158,16 +160,27 @@ class TransformedEnvironment:
         """See VectorEnvironment."""
         return self._transforms.spaces
 
+    @property
+    def seats(self) -> int:
+        """See VectorEnvironment."""
+        return self._games.seats if self._games is not None else 1
+
     def reset(self, seed: int) -> Observed:
         """See VectorEnvironment."""
         observations = self._environments.reset(seed)
         self._over, self._ended = np.zeros((2, self.count), np.bool_)
-        return self._transforms.observe(observations, self._environments.action_mask, np.ones(self.count, np.bool_))
+        needed = np.ones(self.count, np.bool_) if self._games is None else self._games.acting
+        observed = self._transforms.observe(observations, self._environments.action_mask, needed)
+        return observed if self._games is None else observed._replace(acting=self._games.acting, over=self._games.over)
 
     def step(self, actions: dict[str, np.ndarray]) -> Step:
         """See VectorEnvironment."""
         observations, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
         ended = terminated | truncated
+        if self._games is not None:
+            acting = self._games.acting
+            observed = self._transforms.observe(observations, self._games.action_mask, acting & ~ended)
+            return observed._replace(acting=acting, over=self._games.over), rewards, terminated, truncated
         if np.count_nonzero(self._ended):  # a tenth of the time of any()
             rewards = self._rewards_of_steps(rewards, ended)
         self._ended = ended

@@ -17,6 +17,8 @@ class Observed(NamedTuple):
 
     frames: dict[str, np.ndarray]  # of each component [E, *frame_shape]
     masks: dict[str, np.ndarray]  # of the masked actions [E, choices] bool
+    acting: np.ndarray | None = None  # [E] bool, the seats of games that have something new; None: all environments
+    over: np.ndarray | None = None  # of each game, bool: whether its match has ended; None: there are no games
 
 
 Step = tuple[Observed, np.ndarray, np.ndarray, np.ndarray]
@@ -34,6 +36,11 @@ class VectorEnvironment(Protocol):
     @property
     def spaces(self) -> Spaces:
         """The observation and action space of one environment, as the run has them."""
+        ...
+
+    @property
+    def seats(self) -> int:
+        """Seats of each game, which are side by side; 1 for environments with one agent."""
         ...
 
     def reset(self, seed: int) -> Observed:
@@ -70,7 +77,11 @@ class VectorEnvironment(Protocol):
 
 
 class BackendEnvironments(Protocol):
-    """A backend's environments, with their own spaces: they repeat actions and truncate episodes as specified."""
+    """A backend's environments, with their own spaces: they repeat actions and truncate episodes as specified.
+
+    Those of games are seats, E over all copies. A step reaches only the seats that are `acting`: those that had
+    something new after the last one. The reward of a seat is the sum since its last action.
+    """
 
     @property
     def count(self) -> int:

@@ -25,6 +25,7 @@ class RunningEpisodes:
         """Begin before the first observations of the episodes."""
         self._runtime, self._stacks = runtime, ObservationStacks(spaces, environments)
         self._starts = np.ones(environments, np.bool_)
+        self._acting: np.ndarray | None = None  # [E] bool, of games: see Observed
         self._frames: _Components = {}  # the newest
         self._masks: _Components = {}
         self._state = np.zeros((environments, runtime.state_size), np.float32)
@@ -41,8 +42,13 @@ class RunningEpisodes:
 
     def observe(self, observed: Observed) -> None:
         """Take what the environments show after a reset or a step."""
-        self._stacks.push(observed.frames, self._starts)
-        self._starts[:] = False
+        self._acting = observed.acting
+        if observed.acting is None:
+            self._stacks.push(observed.frames, self._starts)
+            self._starts[:] = False
+        else:
+            self._stacks.push(observed.frames, self._starts & observed.acting, observed.acting)
+            self._starts &= ~observed.acting
         self._frames, self._masks = observed.frames, observed.masks
 
     def act(self, noise: Noise, playing: np.ndarray | None = None) -> Choice:
@@ -68,7 +74,10 @@ class RunningEpisodes:
         for name, values in choice.actions.items():
             if not np.isfinite(values[:count][playing]).all():
                 raise PolicyError(f"the policy chose an action whose component {name!r} is not finite: do not use it")
-        self._state = choice.state[:count]
+        if self._acting is None:
+            self._state = choice.state[:count]
+        else:
+            self._state = np.where(self._acting[:, None], choice.state[:count], self._state)
         return choice
 
     def _refuse_unfit(self, playing: np.ndarray) -> None:
@@ -169,8 +178,9 @@ def play_episodes(
     """
     environment_seed, action_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(2))
     results = _Results(episodes)
-    for first in range(0, episodes, environments.count):
-        random = _EpisodeNoise(runtime.noise_size, action_seed, first, _rows(environments.count), sampled)
+    seats = environments.seats
+    for first in range(0, episodes, environments.count // seats):
+        random = _EpisodeNoise(runtime.noise_size, action_seed, first * seats, _rows(environments.count), sampled)
         observed = environments.reset(environment_seed % _SEEDS + first)  # environment e gets this seed + e
         if not _play_round(runtime, environments, observed, random, first, results, longest, progress):
             break
@@ -233,22 +243,26 @@ def _play_round(
 ) -> bool:
     """Play episode `first` + e in each environment e, from the first observations on. See play_episodes.
 
+    An episode of a game is a match, whose seats are all played by the policy; its return is their mean.
+
     What an environment does after the end of its episode is ignored. Returns False if `progress` asked to stop.
     """
-    count = environments.count
-    numbers = first + np.arange(count)  # of the episodes
+    count, seats = environments.count, environments.seats
+    games = count // seats
+    numbers = first + np.arange(games)  # of the episodes
     running = RunningEpisodes(environments.spaces, runtime, count)
     running.observe(observed)
     playing = numbers < len(results.returns)
     for _ in range(longest):
-        choice = running.act(random.draw(), playing)
+        choice = running.act(random.draw(), np.repeat(playing, seats))
         actions = {name: values[:count] for name, values in choice.actions.items()}
         observed, rewards, terminated, truncated = environments.step(actions)
+        rewards = rewards if seats == 1 else rewards.reshape(games, seats).mean(axis=1)
         refuse_unfit_rewards(rewards[playing], numbers[playing])
         running.observe(observed)
         results.returns[numbers[playing]] += rewards[playing]
         results.lengths[numbers[playing]] += 1
-        ended = playing & (terminated | truncated)
+        ended = playing & (terminated | truncated if observed.over is None else observed.over)
         results.ended[numbers[ended]] = True
         playing &= ~ended
         if progress(int(results.ended.sum()), results.mean_return):

@@ -41,11 +41,12 @@ def updates_of(training: TrainingSpec, uploads: Sequence[Upload], *, memory: boo
     """Return the number of policy versions that a batch of these uploads makes; `memory`: the policy has one."""
     if memory:  # gradients make one, whatever their number
         return training.updates_from(sum(upload.environments for upload in uploads if isinstance(upload, Rollout)))
-    return training.updates_from(sum(upload.env_steps for upload in uploads))
+    return training.updates_from(sum(upload.agent_steps for upload in uploads))
 
 
 _SAVED = (
     "env_steps",
+    "agent_steps",
     "updates",
     "updates_skipped",
     "episodes",
@@ -87,6 +88,7 @@ class RunCounters:
 
     target_episodes: int  # number of newest episodes in the mean return
     env_steps: int = 0  # environment steps that were trained on
+    agent_steps: int = 0  # of the agents in them
     updates: int = 0
     updates_skipped: int = 0  # updates without an optimiser step, because the gradient was not finite
     episodes: int = 0
@@ -131,6 +133,7 @@ class RunCounters:
             self.lengths.extend(rollout.episode_lengths.tolist())
             self.episodes += len(rollout.episode_returns)
             self.env_steps += rollout.env_steps
+            self.agent_steps += rollout.agent_steps
             self._add_info(rollout)
         self.rollouts_trained += len(rollouts)
         self.updates += updates

@@ -154,7 +154,7 @@ class RolloutJudge:
                 actor.rejected[verdict.cause] += 1
             else:
                 actor.accepted += 1
-                actor.rows += verdict.env_steps
+                actor.rows += verdict.agent_steps
                 actor.episode_rows += int(verdict.episode_lengths.sum(dtype=np.int64))
                 actor.consecutive_unfit = 0
                 actor.policy_lag = policy_version - verdict.policy_version
@@ -206,13 +206,14 @@ class RolloutJudge:
         They cannot be longer than the rows that it has played. Those are the ones that it has sent: environments begin
         anew when an actor joins. Some may be lost on the way, which sequence numbers show, but they are not believed
         alone. A client plays rows that it never sends, such as while it waits, or while a person steers: it has one
-        environment in a rollout, unless its agents act in step, and lives in real time.
+        environment in a rollout, unless its agents act in step, and lives in real time. The seats of a game play such
+        rows, too, while others act less often.
         """
         lengths = upload.episode_lengths
         if not len(lengths):
             return ""
         rows = self._spec.collection.rollout_length * min(upload.identity.sequence + 1, _LOST * (actor.uploads + 1))
-        if actor.environments == 1 or self._spec.algorithm.synchronous:
+        if actor.environments == 1 or self._spec.algorithm.synchronous or self._spec.environment.is_game:
             rows += int(_CLIENT_ROWS * (now - actor.joined + _BEGIN_SECONDS))
         longest, total = int(lengths.max()), sum(lengths.tolist())
         if longest > rows or actor.episode_rows + total > rows * actor.environments:

@@ -57,6 +57,7 @@ class Films:
     lengths: list[list[int]]
     stacked: bool = False
     played: SyncVectorEnv = field(init=False)
+    seats: int = 1
 
     def __post_init__(self) -> None:
         self.played = SyncVectorEnv(

@@ -1,0 +1,108 @@
+"""Plays one copy of a game with several agents, all with random actions, and reports what it does. No threads."""
+
+import time
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from gymnasium.vector.utils import batch_space, iterate
+
+from daedalus.actor.checking.check_report import EnvironmentReport
+from daedalus.actor.checking.checker import RandomActions
+from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.environments.components import without
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.games import make_games
+from daedalus.actor.environments.gymnasium_environments import limited_close
+from daedalus.actor.environments.transforms import TransformedEnvironment
+from daedalus.policy.user_modules import UserModuleError, UserModules
+from daedalus.protocol.spaces import unfit_number
+from daedalus.protocol.spec import EnvironmentSpec
+
+_LOOKED_AT = 200  # steps whose observations are compared with their space: it takes longer than most steps
+
+
+def check_game(
+    spec: EnvironmentSpec, modules: UserModules, *, seconds: float, env_steps: int, seed: int
+) -> EnvironmentReport:
+    """Make one copy of a game, play it with random actions in all seats, and close it. See check_environment.
+
+    The return of an episode is the mean over the agents.
+    """
+    try:
+        modules.check(spec.user_modules)
+        games = make_games(spec, 1, modules)
+    except (EnvironmentSetupError, UserModuleError) as error:
+        return EnvironmentReport(problems=(str(error),))
+    try:
+        environments = TransformedEnvironment(games, spec)
+        report = EnvironmentReport(spaces=environments.spaces)
+        if seconds == 0.0:
+            return report
+        return report.model_copy(update=_played(environments, games, spec, seconds, env_steps, seed))
+    except EnvironmentSetupError as error:
+        return EnvironmentReport(problems=(str(error),))
+    finally:
+        with suppress(Exception, SystemExit), limited_close():  # of the user's code
+            games.close()
+
+
+def _played(
+    environments: TransformedEnvironment, games: Any, spec: EnvironmentSpec, seconds: float, env_steps: int, seed: int
+) -> dict[str, Any]:
+    """Return the fields of the report that playing tells. Raises EnvironmentSetupError for a problem."""
+    random = RandomActions(environments.spaces.actions, seed)
+    space = without(games.observation_space, spec.leave_out)
+    batch = batch_space(games.observation_space, games.count)
+    warnings: dict[str, str] = {}
+    began = time.monotonic()
+    observed = environments.reset(seed)
+    reset_seconds, busy = time.monotonic() - began, 0.0
+    lengths, returns, steps, length, total = [], [], 0, 0, np.zeros(games.count)
+    until, stepping = time.monotonic() + seconds, 0.0
+    while not steps or (steps < env_steps and time.monotonic() < until):
+        rows = [
+            random.choose({name: mask[[seat]] for name, mask in observed.masks.items()}) for seat in range(games.count)
+        ]
+        began, began_busy = time.monotonic(), time.process_time()
+        observed, rewards, _, _ = environments.step(
+            {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+        )
+        stepping, busy = stepping + time.monotonic() - began, busy + time.process_time() - began_busy
+        assert observed.acting is not None
+        assert observed.over is not None
+        steps, length, total = steps + 1, length + 1, total + rewards
+        _refuse_unfit(games, observed.frames, rewards)
+        if steps <= _LOOKED_AT:
+            for seat, row in enumerate(iterate(batch, games.observations)):
+                if observed.acting[seat]:
+                    for kind, text in observation_violations(space, row, "the game"):
+                        if kind == "problem":
+                            raise EnvironmentSetupError(f"environment {spec.id}: {text}")
+                        warnings.setdefault(kind, f"environment {spec.id}: {text}")
+        if observed.over[0]:
+            lengths.append(length)
+            returns.append(float(total.mean()))
+            length, total = -1, np.zeros(games.count)  # the next step only resets
+    return {
+        "warnings": tuple(warnings.values()),
+        "env_steps": steps,
+        "step_seconds": stepping / steps,
+        "busy_share": min(busy / max(stepping, 1e-9), 1.0),
+        "reset_seconds": reset_seconds,
+        "lengths": tuple(lengths),
+        "returns": tuple(returns),
+    }
+
+
+def _refuse_unfit(games: Any, frames: dict[str, np.ndarray], rewards: np.ndarray) -> None:
+    for seat, agent in enumerate(games.agents):
+        if not np.isfinite(rewards[seat]):
+            raise EnvironmentSetupError(
+                f"environment {games.name}: {agent} has the reward {rewards[seat]}: it must be finite"
+            )
+        for name, values in frames.items():
+            if unfit := unfit_number(values[seat]):
+                raise EnvironmentSetupError(
+                    f"environment {games.name}: {agent} observes a component {name!r} that {unfit}"
+                )

@@ -1,0 +1,465 @@
+"""Backend `pettingzoo`: environments with several agents, each of which is a seat with rows of its own.
+
+A copy of the game is stepped until some of its seats must act. Agents that act together, in turns, leave early or
+appear late are then one case: each step says which seats have something new.
+"""
+
+import importlib
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium
+import numpy as np
+from gymnasium.vector.utils import create_empty_array
+
+from daedalus.actor.environments.components import dtype_misfit, leaves, without
+from daedalus.actor.environments.environment_errors import (
+    EnvironmentSetupError,
+    creation_errors,
+    described,
+    hint_of_count,
+    import_extra,
+    playing_error,
+)
+from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
+from daedalus.actor.environments.vector_environments import BackendStep
+from daedalus.policy.user_code import first_line
+from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
+from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
+
+_AGENT = "agent"  # component of the observation with environment.agent_ids
+_MOST_NAMES = 6  # of agents in a message
+_MOST_IDLE_TURNS = 100_000  # of agents that the policy does not play, between two turns of its seats
+
+_logger = logging.getLogger(__name__)
+
+
+class Outcome(NamedTuple):
+    """What is new for one agent: an observation to act on, or the last one of its episode."""
+
+    agent: str
+    observation: Any
+    reward: float  # since its last action
+    terminated: bool
+    truncated: bool
+    info: Mapping[str, Any]
+
+
+class _Game(Protocol):
+    """One copy of a game, whichever of PettingZoo's two interfaces it has."""
+
+    def reset(self, seed: int | None) -> list[Outcome]:
+        """Begin a match, and return what is new for its first agents."""
+        ...
+
+    def step(self, actions: dict[str, Any]) -> list[Outcome]:
+        """Play on with the actions of the agents that must act, until an agent of ours has something new."""
+        ...
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the match has ended for all agents."""
+        ...
+
+
+class _TurnGame:
+    """A game whose agents act one after the other (PettingZoo's AEC interface)."""
+
+    def __init__(self, environment: Any, agents: Sequence[str], others: Callable[[str, Any, Any], Any]) -> None:
+        self._environment, self._agents, self._others = environment, frozenset(agents), others
+        self._turn: str | None = None  # the agent of ours that must act
+
+    def reset(self, seed: int | None) -> list[Outcome]:
+        """See _Game."""
+        self._environment.reset(seed=seed)
+        self._turn = None
+        return self._advance()
+
+    def step(self, actions: dict[str, Any]) -> list[Outcome]:
+        """See _Game."""
+        if self._turn is not None:
+            action, self._turn = actions[self._turn], None
+            self._environment.step(action)
+        return self._advance()
+
+    @property
+    def is_over(self) -> bool:
+        """See _Game."""
+        return not self._environment.agents
+
+    def _advance(self) -> list[Outcome]:
+        """Return what is new up to the next turn of an agent of ours, at most once for each agent."""
+        environment, outcomes = self._environment, dict[str, Outcome]()
+        for _ in range(_MOST_IDLE_TURNS):
+            if self.is_over:
+                return list(outcomes.values())
+            agent = environment.agent_selection
+            if agent in outcomes:  # the next call passes it on
+                return list(outcomes.values())
+            observation, reward, terminated, truncated, info = environment.last()
+            ended = bool(terminated or truncated)
+            if agent in self._agents:
+                outcomes[agent] = Outcome(agent, observation, float(reward), bool(terminated), bool(truncated), info)
+                if not ended:
+                    self._turn = agent
+                    return list(outcomes.values())
+            environment.step(None if ended else self._others(agent, observation, info))
+        raise _idle()
+
+
+def _idle() -> EnvironmentSetupError:
+    return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
+
+
+class _SimultaneousGame:
+    """A game whose agents act together (PettingZoo's parallel interface)."""
+
+    def __init__(self, environment: Any, agents: Sequence[str], others: Callable[[str, Any, Any], Any]) -> None:
+        self._environment, self._agents, self._others = environment, frozenset(agents), others
+        self._seen: dict[str, tuple[Any, Any]] = {}  # newest observation and info of the agents that are not ours
+
+    def reset(self, seed: int | None) -> list[Outcome]:
+        """See _Game."""
+        observations, infos = self._environment.reset(seed=seed)
+        outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
+        return outcomes or self.step({})
+
+    def step(self, actions: dict[str, Any]) -> list[Outcome]:
+        """See _Game."""
+        for _ in range(_MOST_IDLE_TURNS):
+            outcomes = self._step_once(actions)
+            if outcomes or self.is_over:
+                return outcomes
+        raise _idle()
+
+    def _step_once(self, actions: dict[str, Any]) -> list[Outcome]:
+        before = tuple(self._environment.agents)
+        chosen = {
+            agent: actions[agent] if agent in self._agents else self._others(agent, *self._seen[agent])
+            for agent in before
+        }
+        observations, rewards, terminated, truncated, infos = self._environment.step(chosen)
+        came = [agent for agent in self._environment.agents if agent not in before]
+        return self._outcomes((*before, *came), observations, rewards, terminated, truncated, infos)
+
+    @property
+    def is_over(self) -> bool:
+        """See _Game."""
+        return not self._environment.agents
+
+    def _outcomes(
+        self,
+        agents: Sequence[str],
+        observations: Mapping[str, Any],
+        rewards: Mapping[str, float],
+        terminated: Mapping[str, bool],
+        truncated: Mapping[str, bool],
+        infos: Mapping[str, Any],
+    ) -> list[Outcome]:
+        self._seen = {
+            agent: (observations[agent], infos.get(agent, {})) for agent in agents if agent not in self._agents
+        }
+        return [
+            Outcome(
+                agent,
+                observations[agent],
+                float(rewards.get(agent, 0.0)),
+                bool(terminated.get(agent, False)),
+                bool(truncated.get(agent, False)),
+                infos.get(agent, {}),
+            )
+            for agent in agents
+            if agent in self._agents
+        ]
+
+
+class GameEnvironments:
+    """A BackendEnvironments of E seats: those of each copy of a game side by side, copy after copy."""
+
+    def __init__(self, name: str, copies: Sequence[Any], spec: EnvironmentSpec, seats: tuple[str, ...]) -> None:
+        """Construct from PettingZoo environments, and reset the first: only a reset shows whether there are masks.
+
+        Args:
+          name: id of the game, for errors.
+          copies: the environments, of one kind.
+          spec: which components are left out, and whether the observation names the agent.
+          seats: the agents that the policy plays. The others take random legal actions.
+
+        Raises EnvironmentSetupError.
+        """
+        self.name, self._environments, self.agents = name, list(copies), seats
+        self.seats = len(seats)
+        self.count = len(copies) * len(seats)
+        self._numbers = {agent: number for number, agent in enumerate(seats)}
+        self._others = np.random.default_rng(0)
+        kinds = [_SimultaneousGame if _is_parallel(each) else _TurnGame for each in copies]
+        self._games: list[_Game] = [
+            kind(environment, seats, self._random_action) for kind, environment in zip(kinds, copies, strict=True)
+        ]
+        self._agent_ids = spec.agent_ids
+        self._of_game: gymnasium.Space = copies[0].observation_space(seats[0])
+        self.observation_space = _with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
+        self.action_space: gymnasium.Space = copies[0].action_space(seats[0])
+        read = without(self.observation_space, spec.leave_out)
+        self._leaves = [leaf for leaf in leaves(read, "observation") if leaf.space.shape is not None]
+        self.observations: Any = create_empty_array(self.observation_space, self.count)
+        self._ended = np.zeros(self.count, np.bool_)
+        self._acts = np.zeros(self.count, np.bool_)  # whether the seat has acted in this match
+        self._warned = False
+        self._episode_info = EpisodeInfo()
+        self.acting = np.zeros(self.count, np.bool_)
+        self.action_mask: Any = None
+        self._has_masks: bool | None = None  # in `info`; None before the first reset
+        self.reset(0)
+
+    @property
+    def over(self) -> np.ndarray:
+        """Whether the match of each copy has ended, [copies] bool."""
+        return np.array([game.is_over for game in self._games])
+
+    def reset(self, seed: int) -> Any:
+        """See BackendEnvironments."""
+        self._others = np.random.default_rng(seed)
+        self.acting = np.zeros(self.count, np.bool_)
+        self._ended[:] = self._acts[:] = False
+        for number in range(len(self._games)):
+            self._note(number, self._call("reset", number, seed + number))
+        return self.observations
+
+    def step(self, actions: Any) -> BackendStep:
+        """See BackendEnvironments. The actions of seats that were not acting have no effect."""
+        rewards = np.zeros(self.count)
+        terminated, truncated = np.zeros((2, self.count), np.bool_)
+        acted, self.acting = self.acting, np.zeros(self.count, np.bool_)
+        self._acts |= acted & ~self._ended
+        for number, game in enumerate(self._games):
+            if game.is_over:
+                outcomes = self._call("reset", number, None)
+                if not outcomes:
+                    raise EnvironmentSetupError(f"environment {self.name}: no agent can act after reset")
+            else:
+                first = number * self.seats
+                chosen = {
+                    agent: _only(self.action_space, actions, first + seat) for agent, seat in self._numbers.items()
+                }
+                outcomes = self._call("step", number, chosen)
+            for outcome in self._note(number, outcomes):
+                seat = number * self.seats + self._numbers[outcome.agent]
+                rewards[seat] = outcome.reward
+                terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
+        return self.observations, rewards, terminated, truncated
+
+    def _call(self, call: str, number: int, argument: Any) -> list[Outcome]:
+        try:
+            with USER_STATE:
+                outcomes: list[Outcome] = getattr(self._games[number], call)(argument)
+        except EnvironmentSetupError as error:
+            raise EnvironmentSetupError(f"environment {self.name}: {error}") from None
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise playing_error(self.name, call, error) from error
+        return outcomes
+
+    def _note(self, number: int, outcomes: list[Outcome]) -> list[Outcome]:
+        """Write what is new for the seats of a copy, and return it; a reward without an action is left out."""
+        noted = []
+        for outcome in outcomes:
+            seat = number * self.seats + self._numbers[outcome.agent]
+            self._write(seat, outcome)
+            self.acting[seat] = True
+            if not self._acts[seat] and outcome.reward:
+                self._warn_of_reward(outcome)
+                outcome = outcome._replace(reward=0.0)
+            self._ended[seat] = outcome.terminated or outcome.truncated
+            if self._ended[seat]:
+                self._acts[seat] = False
+                scalars = {
+                    name: np.array([value]) for name, value in info_to_keep(dict(outcome.info), ended=True).items()
+                }
+                self._episode_info.add(scalars, np.array([True]))
+            noted.append(outcome)
+        return noted
+
+    def _write(self, seat: int, outcome: Outcome) -> None:
+        observation = outcome.observation
+        if self._agent_ids:
+            parts = observation if isinstance(observation, Mapping) else {"observation": observation}
+            observation = {**parts, _AGENT: self._numbers[outcome.agent]}
+        for leaf in self._leaves:
+            try:
+                value = leaf.of(observation)
+            except (KeyError, IndexError, TypeError, ValueError):
+                value = None
+            if value is None or value.shape != leaf.space.shape or (dtype_misfit(leaf.space, value)):
+                raise EnvironmentSetupError(
+                    f"environment {self.name}: {outcome.agent} observes {described(observation)}, which is not of its "
+                    f"space {described(self._of_game)}"
+                )
+            leaf.of(self.observations)[seat] = value
+        self._write_mask(seat, outcome)
+
+    def _write_mask(self, seat: int, outcome: Outcome) -> None:
+        mask = outcome.info.get(MASK_KEY) if isinstance(outcome.info, Mapping) else None
+        if self._has_masks is None:
+            self._has_masks = mask is not None
+        if mask is None and not self._has_masks:
+            return
+        if mask is None:
+            if not (outcome.terminated or outcome.truncated):
+                raise EnvironmentSetupError(
+                    f"environment {self.name}: info of {outcome.agent} has no {MASK_KEY!r} any more: "
+                    "give it in every step"
+                )
+            return
+        rows = mask_of_one(mask)
+        if not self._has_masks or not isinstance(rows, np.ndarray):
+            raise EnvironmentSetupError(
+                f"environment {self.name}: info of {outcome.agent} has an {MASK_KEY} of another form than at first: "
+                "give one array over all choices, from reset on"
+            )
+        if self.action_mask is None:
+            self.action_mask = np.ones((self.count, rows.shape[1]), rows.dtype)
+        if rows.shape[1] != self.action_mask.shape[1]:
+            raise EnvironmentSetupError(
+                f"environment {self.name}: the {MASK_KEY} of {outcome.agent} has {rows.shape[1]} choices, but had "
+                f"{self.action_mask.shape[1]} before"
+            )
+        self.action_mask[seat] = rows[0]
+
+    def _warn_of_reward(self, outcome: Outcome) -> None:
+        if not self._warned:
+            self._warned = True
+            _logger.warning(
+                "environment %s: %s has the reward %g before its first action of a match: such rewards are ignored",
+                self.name,
+                outcome.agent,
+                outcome.reward,
+            )
+
+    def _random_action(self, agent: str, observation: Any, info: Any) -> Any:
+        """Return a legal action of an agent that the policy does not play."""
+        space = self._environments[0].action_space(agent)
+        mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
+        if mask is None and isinstance(info, Mapping):
+            mask = info.get(MASK_KEY)
+        if mask is not None and isinstance(space, gymnasium.spaces.Discrete):
+            return int(space.start) + int(self._others.choice(np.flatnonzero(mask)))
+        space.seed(int(self._others.integers(2**31)))
+        return space.sample()
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See BackendEnvironments."""
+        return self._episode_info.take()
+
+    def close(self) -> None:
+        """Close all copies, then raise the first exception that one of them raised."""
+        environments, self._environments = self._environments, []
+        errors: list[BaseException] = []
+        for environment in environments:
+            try:
+                environment.close()
+            except (Exception, SystemExit) as error:  # of the user's code
+                errors.append(error)
+        if errors:
+            raise EnvironmentSetupError(f"environment {self.name}: close raises {first_line(errors[0])}") from errors[0]
+
+
+def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameEnvironments:
+    """Return `count` copies of the game that a specification names. Raises EnvironmentSetupError."""
+    copies: list[Any] = []
+    try:
+        for made in range(count):
+            with creation_errors(spec.id, hint_of_count(made, count)):
+                copies.append(_make(spec, modules))
+        return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
+    except BaseException:
+        for each in copies:
+            each.close()
+        raise
+
+
+def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
+    module_name, colon, function = spec.id.partition(":")
+    if colon:
+        try:
+            make = modules.attribute("environment.id", spec.id)
+        except UserModuleError as error:
+            raise EnvironmentSetupError(str(error)) from error
+    else:
+        module = _module(module_name)
+        make = getattr(module, "parallel_env", None) or getattr(module, "env", None)
+        function = "env"
+    if not callable(make):
+        raise EnvironmentSetupError(f"environment {spec.id}: there is no function {function}() that makes the game")
+    environment = make(**spec.constructor_kwargs)
+    if not hasattr(environment, "possible_agents"):
+        raise EnvironmentSetupError(
+            f"environment {spec.id} made {type(environment).__name__}, which has no possible_agents: "
+            "return a PettingZoo AECEnv or ParallelEnv"
+        )
+    return environment
+
+
+def _module(name: str) -> Any:
+    package = name.partition(".")[0]
+    if package not in GAME_PACKAGES:
+        raise EnvironmentSetupError(
+            f"unknown game {name!r}: name a module of {' or '.join(GAME_PACKAGES)}, or module:function for your own"
+        )
+    import_extra(package, "pettingzoo", f"environment {name}")
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and name.startswith(error.name):
+            raise EnvironmentSetupError(f"unknown game {name!r}: {first_line(error)}") from None
+        raise
+
+
+def _is_parallel(environment: Any) -> bool:
+    return not hasattr(environment, "agent_iter")
+
+
+def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
+    """Return the agents that the policy plays. Raises EnvironmentSetupError if their spaces differ."""
+    possible = tuple(environment.possible_agents)
+    unknown = [agent for agent in spec.agents if agent not in possible]
+    if unknown:
+        raise EnvironmentSetupError(
+            f"environment.agents names {unknown[0]!r}, but the agents of {spec.id} are {_listed(possible)}"
+        )
+    chosen = tuple(agent for agent in possible if agent in spec.agents) or possible
+    groups: dict[str, list[str]] = {}
+    for agent in chosen:
+        spaces = f"{environment.observation_space(agent)} {environment.action_space(agent)}"
+        groups.setdefault(spaces, []).append(agent)
+    if len(groups) > 1:
+        parts = "; ".join(_listed(group) for group in groups.values())
+        first = next(iter(groups.values()))
+        raise EnvironmentSetupError(
+            f"the agents of {spec.id} have different spaces ({parts}), and one policy plays agents with the same ones: "
+            f'choose them, as in --set "environment.agents={first}"; the others then take random actions'
+        )
+    return chosen
+
+
+def _listed(agents: Sequence[str]) -> str:
+    more = len(agents) - _MOST_NAMES
+    return ", ".join(agents[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def _with_agent(space: gymnasium.Space, seats: int) -> gymnasium.spaces.Dict:
+    parts = dict(space.spaces) if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
+    if _AGENT in parts:
+        raise EnvironmentSetupError(
+            f"the observation has a component {_AGENT!r} of its own: leave environment.agent_ids unset"
+        )
+    return gymnasium.spaces.Dict({**parts, _AGENT: gymnasium.spaces.Discrete(seats)})
+
+
+def _only(space: gymnasium.Space, batch: Any, row: int) -> Any:
+    """Return the action of one seat from the batch of all."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return {key: _only(part, batch[key], row) for key, part in space.spaces.items()}
+    if isinstance(space, gymnasium.spaces.Tuple):
+        return tuple(_only(part, batch[index], row) for index, part in enumerate(space.spaces))
+    return batch[row]
