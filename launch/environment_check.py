@@ -17,6 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daedalus.launch.process_lifecycle import interrupts_held
+from daedalus.policy.user_code import names_place
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -261,7 +262,10 @@ def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "Envir
         _logger.warning("the check of the environment was %s: the run starts without it%s", error, hint)
         return EnvironmentReport()
     if report.problems:
-        raise EnvironmentProblemError(with_preset(report.problems[0], spec))
+        problem = with_preset(report.problems[0], spec)
+        # Nothing is recorded yet: the check has no terminal, and the run no folder.
+        hint = "; `daedalus check` with the same options shows the traceback" if names_place(problem) else ""
+        raise EnvironmentProblemError(f"{problem}{hint}")
     for warning in report.warnings:
         _logger.warning("%s", warning)
     return report

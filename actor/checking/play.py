@@ -29,7 +29,7 @@ from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
-from daedalus.policy.user_code import first_line, place_of
+from daedalus.policy.user_code import first_line, place_of, print_traceback
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
@@ -389,6 +389,8 @@ class _Play:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
             wrong = self._structure_of(method, arguments, keywords) if isinstance(error, TypeError | ValueError) else ""
+            if not wrong:
+                print_traceback(error)
             raise _ProblemError(wrong or f"{method} raises {first_line(error)}{place_of(error)}") from None
 
     def _structure_of(self, method: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> str:
