@@ -48,14 +48,14 @@ class EpisodeCounter:
             self._returns[self.ended] = 0.0
             self._lengths[self.ended] = 0
 
-    def step_seats(self, acted: np.ndarray, rewards: np.ndarray, ended: np.ndarray, reported: np.ndarray) -> None:
-        """Count a step of the seats that `acted`; of those whose episode `ended`, give the `reported` ones; all [E]."""
+    def step_seats(self, acted: np.ndarray, rewards: np.ndarray, ended: np.ndarray) -> None:
+        """Count a step of the seats that `acted`, with their rewards, and whether their episodes `ended`; all [E]."""
         valid = acted & ~self.ended
         self._returns[valid] += rewards[valid]
         self._lengths += valid
         ended = valid & ended
         if np.count_nonzero(ended):
-            self._finished.append((self._returns[ended & reported], self._lengths[ended & reported]))
+            self._finished.append((self._returns[ended], self._lengths[ended]))
             self._returns[ended] = 0.0
             self._lengths[ended] = 0
         self.ended = np.where(acted, ended, self.ended)
@@ -321,8 +321,8 @@ class SeatWriter(RolloutWriter):
             self._initial_state[first] = self._state[first]
         self._writing[acting] = writing[acting]
         valid = writing & ~self._episodes.ended
-        self._env_steps += np.count_nonzero(valid.reshape(-1, self._seats).any(axis=1))
-        self._skipped += np.count_nonzero(acting & ~writing)
+        self._env_steps += int(np.count_nonzero(valid.reshape(-1, self._seats).any(axis=1)))
+        self._skipped += int(np.count_nonzero(acting & ~writing))
         self._refuse_absent_seats()
         return RowInputs(
             {name: values[acting] for name, values in self._stacks.observations.items()},
@@ -361,8 +361,8 @@ class SeatWriter(RolloutWriter):
             goes_on = ~resets & np.isfinite(self._next_state).all(axis=1)
             self._state[acted] = np.where(goes_on[:, None], self._next_state, np.float32(0.0))[acted]
         self._show(observed)
-        written = acted & self._writing
-        self._episodes.step_seats(acted, rewards.astype(np.float32), terminated | truncated, written)
+        # Also those that are not written: the agents who act most often would have too few results in the mean.
+        self._episodes.step_seats(acted, rewards.astype(np.float32), terminated | truncated)
         self._writing[acted] = False
         return bool((self._rows == len(self._rewards)).all())
 
@@ -377,7 +377,13 @@ class SeatWriter(RolloutWriter):
                 "more than half of the agents' steps are not learned from, for some agents act much more often than "
                 "others: each has as many rows in a rollout (environment.agents chooses the agents)"
             )
-        rollout = replace(rollout, game_steps=self._env_steps)
+        most = self._rewards.size  # results in one rollout
+        rollout = replace(
+            rollout,
+            episode_returns=rollout.episode_returns[-most:],
+            episode_lengths=rollout.episode_lengths[-most:],
+            game_steps=self._env_steps,
+        )
         self._rows[:] = 0
         self._env_steps = self._skipped = 0
         return rollout

@@ -277,6 +277,8 @@ class RolloutJudge:
 
     def _value_violation(self, rollout: Rollout) -> str:
         environment = self._spec.environment
+        if rollout.game_steps is not None and not environment.is_game:
+            return "game_steps is set, but the run plays no game with several agents"
         if environment.reward_clip is not None:
             largest = environment.reward_clip * environment.reward_scale
             if np.abs(rollout.rewards).max() > largest * (1 + 1e-5):
@@ -314,8 +316,9 @@ def _episode_violation(rollout: Rollout) -> str:
         return "every row is overridden: there is none to learn from"
     if (rollout.valid[1:] == ends[:-1]).any():
         return "valid breaks the reset rule: a row must be invalid if, and only if, an episode ended in the row before"
-    if len(rollout.episode_returns) != np.count_nonzero(ends):
-        return f"episode_returns has {len(rollout.episode_returns)} values, but {np.count_nonzero(ends)} episodes ended"
+    reported, ended = len(rollout.episode_returns), np.count_nonzero(ends)
+    if reported < ended or (reported > ended and rollout.game_steps is None):  # not every row of a game is sent
+        return f"episode_returns has {reported} values, but {ended} episodes ended"
     return ""
 
 
