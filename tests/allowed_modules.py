@@ -12,6 +12,7 @@ TEST_MODULES = UserModules(
             "mission_environment",
             "nested_environment",
             "picture_environment",
+            "scripted_games",
             "test_car_racing",
         }
     )
