@@ -211,6 +211,7 @@ class RunStatus(Specification):
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
     updates_per_batch: int = 1  # by which a policy lag in updates is one in batches
+    agent_steps: int | None = None  # learned from, of the agents of a game; None: one agent acts in each env_step
 
     @property
     def fleet_size(self) -> int:

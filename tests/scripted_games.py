@@ -76,7 +76,7 @@ def rows(seed: int, number: int, agents: int, *, together: bool) -> dict[Key, Ro
     return found
 
 
-class _Scripted:
+class Scripted:
     """What both interfaces share."""
 
     metadata: ClassVar[dict] = {"name": "scripted", "is_parallelizable": False}
@@ -88,8 +88,8 @@ class _Scripted:
         self.possible_agents = [f"agent_{number}" for number in range(agents)]
         self.agents: list[str] = []
         self.number = -1
-        self.copy = _Scripted.made
-        _Scripted.made += 1
+        self.copy = Scripted.made
+        Scripted.made += 1
 
     def observation_space(self, agent: str) -> Box:
         return Box(-1e6, 1e6, (3,), np.float32)
@@ -118,7 +118,7 @@ class _Scripted:
         return [self.possible_agents[agent] for agent in agents]
 
 
-class Turns(_Scripted, AECEnv):
+class Turns(Scripted, AECEnv):
     """The game with one agent after the other."""
 
     def __init__(self, seed: int, agents: int) -> None:
@@ -162,7 +162,7 @@ class Turns(_Scripted, AECEnv):
         self._deads_step_first()
 
 
-class Together(_Scripted, ParallelEnv):
+class Together(Scripted, ParallelEnv):
     """The game with all agents at once."""
 
     def __init__(self, seed: int, agents: int) -> None:

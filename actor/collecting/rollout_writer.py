@@ -274,8 +274,9 @@ class RolloutWriter:
             terminated=self._terminated,
             truncated=self._truncated,
             valid=self._valid,
-            episode_returns=finished.returns,
-            episode_lengths=finished.lengths,
+            # Seats that play on without rows may end more episodes than a rollout can report: the newest.
+            episode_returns=finished.returns[-self._rewards.size :],
+            episode_lengths=finished.lengths[-self._rewards.size :],
             episode_info=episode_info or {},
             overridden=self._overridden if self._overridden.any() else None,
         )
@@ -377,13 +378,7 @@ class SeatWriter(RolloutWriter):
                 "more than half of the agents' steps are not learned from, for some agents act much more often than "
                 "others: each has as many rows in a rollout (environment.agents chooses the agents)"
             )
-        most = self._rewards.size  # results in one rollout
-        rollout = replace(
-            rollout,
-            episode_returns=rollout.episode_returns[-most:],
-            episode_lengths=rollout.episode_lengths[-most:],
-            game_steps=self._env_steps,
-        )
+        rollout = replace(rollout, game_steps=self._env_steps)
         self._rows[:] = 0
         self._env_steps = self._skipped = 0
         return rollout

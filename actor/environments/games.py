@@ -6,6 +6,7 @@ appear late are then one case: each step says which seats have something new.
 
 import importlib
 import logging
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -408,7 +409,9 @@ def _module(name: str) -> Any:
         )
     import_extra(package, "pettingzoo", f"environment {name}")
     try:
-        return importlib.import_module(name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # newer releases also have names without a module
+            return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name is not None and name.startswith(error.name):
             raise EnvironmentSetupError(f"unknown game {name!r}: {first_line(error)}") from None

@@ -85,6 +85,8 @@ def make_bare(
 
 def _refuse_gymnasium_options(spec: EnvironmentSpec, asked: dict[str, object]) -> None:
     names = [name for name, value in asked.items() if value is not None]
+    if names and spec.is_game:
+        raise EnvironmentSetupError(f"games with several agents cannot be shown or filmed yet: {spec.id} is one")
     if names:
         raise EnvironmentSetupError(
             f"environment.backend={spec.backend} does not support {' and '.join(names)}: "

@@ -214,12 +214,13 @@ def _table(status: RunStatus) -> list[str]:
     mean = "-" if status.episode_return_mean is None else short_number(status.episode_return_mean)
     age = status.checkpoint_age_seconds
     skipped = f" ({status.updates_skipped:,} skipped)" if status.updates_skipped else ""
+    agents = "" if status.agent_steps is None else f" ({status.agent_steps:,} agent_steps)"
     return [
         f"run {status.run}: {status.environment}, {status.algorithm}, up {status.uptime_seconds:.0f} s, "
         f"epoch {status.learner_epoch:x}",
         *(f"  PROBLEM: {problem}" for problem in status.problems),
         *_expiry(status.certificate_days_left),
-        f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}, "
+        f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}{agents}, "
         f"updates {status.updates:,}{skipped}",
         f"  {status.env_steps_per_second:,.0f} env_steps/s, {status.updates_per_second:,.1f} updates/s, "
         f"policy lag {policy_lag(status.policy_lag_mean, status.updates_per_batch)}",

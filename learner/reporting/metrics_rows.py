@@ -11,7 +11,7 @@ import numpy as np
 
 # By the group that TensorBoard shows them in. docs/reference/metrics.md explains each column.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "time": ("wall_seconds", "env_steps", "updates", "env_steps_per_second", "updates_per_second"),
+    "time": ("wall_seconds", "env_steps", "agent_steps", "updates", "env_steps_per_second", "updates_per_second"),
     "rollout": (
         "episodes",
         "episode_return_mean",

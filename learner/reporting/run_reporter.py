@@ -145,6 +145,7 @@ class RunReporter:
             row = {
                 "wall_seconds": context.wall_seconds(now),
                 "env_steps": counters.env_steps,
+                **self._agent_steps(),
                 "updates": counters.updates,
                 "episodes": counters.episodes,
                 **episode_statistics(counters),
@@ -163,6 +164,11 @@ class RunReporter:
             }
         self._learning_hint.add(row)
         return row
+
+    def _agent_steps(self) -> dict[str, int]:
+        """Return the agent_steps of a game, by their name; nothing for an environment with one agent."""
+        game = self._context.spec.environment.is_game
+        return {"agent_steps": self._counters.agent_steps} if game else {}
 
     def _hint(self) -> str:
         """Return a hint for the user if one is due, else an empty string."""
@@ -219,6 +225,7 @@ class RunReporter:
             refused_joins=fleet.refused_joins.report(now),
             actors=page(fleet, "", now),
             updates_per_batch=spec.training.updates_per_batch,
+            **self._agent_steps(),
         )
 
     def summary(self, *, finished: bool, now: float) -> dict[str, Any]:
@@ -235,6 +242,7 @@ class RunReporter:
             "solved": counters.seconds_to_target is not None,
             "finished": finished,
             "env_steps": counters.env_steps,
+            **self._agent_steps(),
             "updates": counters.updates,
             "updates_skipped": counters.updates_skipped,
             "episodes": counters.episodes,

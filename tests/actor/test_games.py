@@ -1,14 +1,29 @@
 """Games with several agents: the rows of each seat, what is refused, and a training of one policy in all seats."""
 
+import re
+from typing import Any, ClassVar
+
 import numpy as np
+import pytest
 import scripted_games
 from collectors import collect, started_collector
+from gymnasium.spaces import Box, Discrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pettingzoo import ParallelEnv
 from plain import PlainPolicy
 
+from daedalus.actor.checking.check_report import EnvironmentReport
+from daedalus.actor.checking.play import check_environment
+from daedalus.actor.environments.make import make_environments
+from daedalus.actor.evaluation.episodes import play_episodes
+from daedalus.learner.run.settings import SettingsError, run_spec
+from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.noise import Noise
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import DiscreteSpace
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
 
 ROLLOUTS = 6
 
@@ -39,7 +54,7 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
 ) -> None:
     spec = EnvironmentSpec(id=f"scripted_games:{kind}", backend="pettingzoo", kwargs={"seed": seed, "agents": agents})
     scripted_games.PLAYED.clear()
-    first_copy = scripted_games._Scripted.made
+    first_copy = scripted_games.Scripted.made
     collector = started_collector(spec, Counting(), count=copies, rollout_length=length)
     together = kind == "Together"
     accounts: dict[int, dict] = {}
@@ -70,11 +85,135 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
                     assert rollout.initial_state[column, 0] == frames[0, column, 2]
             assert rollout.agent_steps == np.count_nonzero(rollout.valid)
             assert rollout.env_steps == len(steps)
-            lengths = [
-                len([key for key in account if key[1] == agent])
+            for match in {key[0] for _, key in scripted_games.PLAYED}:
+                accounts.setdefault(match, scripted_games.rows(seed, match, agents, together=together))
+            episodes = {
+                (sum(row.reward for row in played), len(played))
                 for account in accounts.values()
                 for agent in range(agents)
-            ]
-            assert set(rollout.episode_lengths.tolist()) <= set(lengths)
+                if (played := [row for key, row in account.items() if key[1] == agent])
+            }
+            results = zip(rollout.episode_returns.tolist(), rollout.episode_lengths.tolist(), strict=True)
+            assert set(results) <= episodes
     finally:
         collector.close()
+
+
+def make(problem: str = "", **fields: Any) -> EnvironmentReport:
+    """Check a game of this module, with a fault."""
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": problem}, **fields)
+    return check_environment(spec, UserModules(frozenset({"test_games"})), seconds=5.0, env_steps=20)
+
+
+class Duel(ParallelEnv):
+    """Two agents guess a bit of their observation; a match has five steps."""
+
+    metadata: ClassVar[dict] = {"name": "duel"}
+    possible_agents: ClassVar[list[str]] = ["red", "blue"]
+
+    def __init__(self, problem: str = "") -> None:
+        self.problem = problem
+
+    def observation_space(self, agent: str) -> Box:
+        return Box(0.0, 1.0, (3 if self.problem == "spaces" and agent == "blue" else 2,), np.float32)
+
+    def action_space(self, agent: str) -> Discrete:
+        return Discrete(2)
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> Any:
+        self.agents, self.left = list(self.possible_agents), 5
+        return self._seen(), self._info()
+
+    def step(self, actions: dict[str, int]) -> Any:
+        if self.problem == "raises":
+            raise RuntimeError("the table broke")
+        self.left -= 1
+        here, over = self.agents, self.left == 0
+        rewards = {agent: float(actions[agent]) if self.problem != "reward" else np.nan for agent in here}
+        self.agents = [] if over else here
+        return self._seen(), rewards, dict.fromkeys(here, over), dict.fromkeys(here, False), self._info()
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        more = 2 if self.problem == "shape" and self.left < 5 else 0
+        return {
+            agent: np.full(self.observation_space(agent).shape[0] + more, 0.5, np.float32)
+            for agent in self.possible_agents
+        }
+
+    def _info(self) -> dict[str, dict]:
+        mask = np.array([0, 0 if self.problem == "no choice" and self.left < 5 else 1], np.int8)
+        return {agent: {"action_mask": mask} for agent in self.possible_agents}
+
+
+def test_a_game_is_checked() -> None:
+    report = make()
+    assert report.problems == ()
+    assert set(report.lengths) == {5}
+    assert set(report.returns) == {5.0}  # the mask leaves one action
+
+
+@pytest.mark.parametrize(
+    ("problem", "fields", "text"),
+    [
+        ("spaces", {}, r"have different spaces \(red; blue\).*environment.agents=\['red'\]"),
+        ("", {"agents": ("green",)}, "names 'green', but the agents of test_games:Duel are red, blue"),
+        ("shape", {}, "(red|blue) observes .* which is not of its space"),
+        ("no choice", {}, "forbids every choice"),
+        ("reward", {}, "red has the reward nan: it must be finite"),
+        ("raises", {}, "step raises RuntimeError: the table broke"),
+    ],
+)
+def test_faults_of_games_are_named(problem: str, fields: dict[str, Any], text: str) -> None:
+    (found,) = make(problem, **fields).problems
+    assert re.search(text, found), found
+    assert "\n" not in found
+
+
+def test_one_agent_of_two_may_be_the_policys() -> None:
+    report = make("spaces", agents=("red",))
+    assert report.problems == ()
+    assert report.spaces is not None
+    assert report.spaces.observations["observation"].shape == (2,)
+
+
+def test_agent_ids_are_a_component_of_the_observation() -> None:
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", agent_ids=True, kwargs={"problem": ""})
+    environments = make_environments(spec, 2, modules=UserModules(frozenset({"test_games"})))
+    observed = environments.reset(1)
+    environments.close()
+    assert environments.spaces.observations["agent"] == DiscreteSpace(counts=(2,))
+    assert observed.frames["agent"].ravel().tolist() == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"environment": {"id": "CartPole-v1", "agents": ["red"]}},
+        {"environment": {"id": "pettingzoo.classic.rps_v2", "action_repeat": 2}},
+        {
+            "environment": {"id": "mpe2.simple_v3"},
+            "collection": {"upload": "gradients"},
+            "training": {"algorithm": "a3c"},
+        },
+    ],
+)
+def test_settings_that_do_not_fit_games_are_refused(fields: dict[str, Any]) -> None:
+    with pytest.raises(SettingsError, match="game"):
+        run_spec(fields)
+
+
+@pytest.mark.parametrize("name", ["pettingzoo.classic.tictactoe_v3", "pettingzoo.classic.rps_v2"])
+def test_games_of_pettingzoo_can_be_evaluated(name: str) -> None:
+    spec = EnvironmentSpec(id=name)
+    environments = make_environments(spec, 3, one_episode=True)
+    learner = Learner(TrainingSpec(), PolicySpec(hidden=(8,)), environments.spaces)
+    runtime = OnnxRuntime(learner.program())
+    runtime.load(learner.weights())
+    try:
+        played = play_episodes(runtime, environments, 7, 1, sampled=True)
+        again = play_episodes(runtime, environments, 7, 1, sampled=True)
+    finally:
+        environments.close()
+    assert played.returns.tolist() == again.returns.tolist() == [0.0] * 7  # what one wins the other loses
+    assert played.lengths.tolist() == again.lengths.tolist()
+    assert not played.cut.any()

@@ -54,6 +54,15 @@ def test_the_environment_can_be_played(folder: Path) -> None:
     environments.close()
 
 
+def test_the_game_can_be_played(folder: Path) -> None:
+    (folder / "meeting.py").write_text(example("several_agents.md"))
+    spec = EnvironmentSpec(id="meeting:Meeting", backend="pettingzoo")
+    report = check_environment(spec, UserModules(frozenset({"meeting"})), seconds=30.0, env_steps=500)
+    assert (report.problems, report.warnings) == ((), ())
+    assert max(report.lengths) == 40
+    assert -2.01 < min(report.returns) < 0.0 < max(report.returns) <= 1.0
+
+
 def test_the_readmes_environment_of_one_s_own_works_as_it_is_pasted(folder: Path) -> None:
     code = code_blocks((ROOT / "README.md").read_text("utf-8"), "python")[0]
     assert len([line for line in code.splitlines() if line]) <= 12
