@@ -1,7 +1,7 @@
 """Games with several agents: the rows of each seat, what is refused, and a training of one policy in all seats."""
 
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,8 +65,8 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
             frames, steps = rollout.frames["observation"], set()
             for column in range(copies * agents):
                 for row in np.flatnonzero(rollout.valid[:, column]):
-                    key = tuple(int(number) for number in frames[row, column])
-                    match, agent, _ = key
+                    match, agent, number = (int(number) for number in frames[row, column])
+                    key = (match, agent, number)
                     assert agent == column % agents
                     assert key > last.get(column, (-1, -1, -1))[:3]  # in order, and none twice
                     last[column] = key
@@ -108,10 +108,8 @@ def make(problem: str = "", **fields: Any) -> EnvironmentReport:
 class Duel(ParallelEnv):
     """Two agents guess a bit of their observation; a match has five steps."""
 
-    metadata: ClassVar[dict] = {"name": "duel"}
-    possible_agents: ClassVar[list[str]] = ["red", "blue"]
-
     def __init__(self, problem: str = "") -> None:
+        self.metadata, self.possible_agents = {"name": "duel"}, ["red", "blue"]
         self.problem = problem
 
     def observation_space(self, agent: str) -> Box:
