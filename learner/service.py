@@ -118,12 +118,12 @@ class LearnerService:
             return self._learn(learner, checkpointer, loop)
         finally:
             self._server.close(self._why_stopped)  # unless it is closed
-            EventFile(self._context.directory).add(self._context.events.take_new())
             self._heartbeat.clear()
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
         self._server.close(self._why_stopped)
+        EventFile(self._context.directory).add(self._context.events.take_new())
         self._server.orders.take_checkpoint()(True, "stopped before the first actor joined: there is nothing to save")
         return Outcome(
             solved=False,

@@ -54,10 +54,10 @@ class OrderRequest:
 
     order: Order
     run: str = ""  # of the learner
-    learner_epoch: int = -1  # likewise
+    learner_epoch: int = 0  # likewise
     number: int = 0  # at random: no other order to this learner has it
     actor: str = ""  # that is drained
-    incarnation: int = -1  # of an actor that waits for a run
+    incarnation: int = 0  # of an actor that waits for a run
     # Who gives the order, besides the operator's name in the key, as the sender states it.
     host: str = ""
     token: str = ""  # whose token the page of a gateway sent, such as `operator alice`; empty if it is not from a page
@@ -237,6 +237,7 @@ class RunStatus(Specification):
     actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
+    updates_per_batch: int = 1  # by which a policy lag in updates is one in batches
     last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
 
     @property

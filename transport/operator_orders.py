@@ -63,7 +63,7 @@ class Operator:
         transport.publish(keys.orders(keys.NO_RUN, self.name), encode(message))
 
     def _order(
-        self, order: Order, *, run: str, actor: str, learner_epoch: int = -1, incarnation: int = -1
+        self, order: Order, *, run: str, actor: str, learner_epoch: int = 0, incarnation: int = 0
     ) -> OrderRequest:
         return OrderRequest(
             order=order,

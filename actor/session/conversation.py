@@ -323,7 +323,8 @@ class Conversation:
                 remedy = yield from self._remedy(run, join)
                 raise NoLearnerError(f"no learner answered within {timeout:g} s: {remedy}")
             if pause >= _MAX_RETRY_SECONDS and self.now >= log_at and not asks_only:
-                self._show_waiting()
+                if not awaited:
+                    self._show_waiting()
                 log_at = self.now + _LOOK_AROUND_SECONDS
                 self.check_over()  # the request may have taken 5 s, and the next one may too
                 text = f"waiting for {awaited or (yield from self._awaited(run, join))}"
@@ -496,8 +497,7 @@ def _raise_if_over(answers: list[Message]) -> None:
             raise drained(answer.reason)
 
 
-def drained(author: str) -> RunOverError:
-    """Return why this actor leaves, after an order by `author`."""
-    return RunOverError(
-        f"drained by {bounded_text(author, MAX_ANSWER_TEXT) or 'an operator'}: this actor leaves the run"
-    )
+def drained(reason: str) -> RunOverError:
+    """Return why this actor leaves, as the learner says: who ordered it."""
+    order = bounded_text(reason, MAX_ANSWER_TEXT) or "drained by an operator"
+    return RunOverError(f"{order}: this actor leaves the run")

@@ -103,13 +103,20 @@ def drain_parser() -> argparse.ArgumentParser:
 def stop(arguments: list[str]) -> int:
     """Run `daedalus stop` and return its exit status."""
     parsed = stop_parser().parse_args(arguments)
-    return _give("stop", parsed, [parsed.run], lambda *network: stop_run(*network, parsed.run, parsed.timeout))
+    return _give(
+        "stop",
+        parsed,
+        [parsed.run],
+        lambda transport, operator: stop_run(transport, operator, parsed.run, parsed.timeout),
+    )
 
 
 def checkpoint(arguments: list[str]) -> int:
     """Run `daedalus checkpoint` and return its exit status."""
     parsed = checkpoint_parser().parse_args(arguments)
-    return _give("checkpoint", parsed, [parsed.run], lambda *network: save_checkpoint(*network, parsed.run))
+    return _give(
+        "checkpoint", parsed, [parsed.run], lambda transport, operator: save_checkpoint(transport, operator, parsed.run)
+    )
 
 
 def drain(arguments: list[str]) -> int:
@@ -119,7 +126,7 @@ def drain(arguments: list[str]) -> int:
         "drain",
         parsed,
         parsed.actors,
-        lambda *network: drain_actors(*network, parsed.run, parsed.actors, parsed.timeout),
+        lambda transport, operator: drain_actors(transport, operator, parsed.run, parsed.actors, parsed.timeout),
     )
 
 

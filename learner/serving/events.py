@@ -29,6 +29,11 @@ _MAX_BYTES = 1 << 20  # later events are left out
 _MAX_TEXT = 300  # characters
 
 
+def dated(text: str) -> str:
+    """Return a text with the time before it, by the clock of this host."""
+    return f"{utc(time.time())}: {text}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedEvent:
     """One event, or several equal ones. Peers cause events: the texts come from outside."""

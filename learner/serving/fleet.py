@@ -417,7 +417,7 @@ class Fleet:
             return Refusal(code="malformed", reason=str(error))
         known, former = self.actors.get(join.actor), self._former[join.actor, join.incarnation]
         if known is not None and known.incarnation == join.incarnation:
-            return Refusal(code="drained", reason=known.drained_by) if known.drained_by else None
+            return Refusal(code="drained", reason=f"drained by {known.drained_by}") if known.drained_by else None
         if former.quarantined:
             return Refusal(code="malformed", reason=f"this process was quarantined: {former.quarantined}; restart it")
         if former.replaced:

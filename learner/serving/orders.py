@@ -4,18 +4,17 @@ Whether a sender may give orders at all, and under which name, is checked by the
 """
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 
-from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY
+from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, dated
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.waiting_requests import read_request
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import Acknowledgement, OrderRequest, Refusal
-from daedalus.protocol.texts import bounded_text, utc
+from daedalus.protocol.texts import bounded_text
 from daedalus.transport.interface import Request
 
 _ANSWER_SECONDS = 3.0  # whoever gives an order waits 5 s for its answer
@@ -69,7 +68,7 @@ class Orders:
             text = f"refused to {_infinitive(message)} as ordered by {author}: {refusal.reason}"
             context.events.add("refused", text, cause="order")
             return refusal
-        self.last = bounded_text(f"{utc(time.time())}: {_infinitive(message)}, by {author}")
+        self.last = bounded_text(dated(f"{_infinitive(message)}, by {author}"))
         if message.order == "drain":
             text = f"{DRAINED_BY}{author}: it leaves after its current rollout"
             context.events.add("left", text, actor=message.actor)

@@ -414,7 +414,7 @@ class RolloutIntake:
         actor = self._fleet.actors.get(sender)
         if actor is None or not actor.drained_by or answer.verdict not in ("accepted", "rejected"):
             return answer
-        return replace(answer, verdict="drained", reason=actor.drained_by)
+        return replace(answer, verdict="drained", reason=f"drained by {actor.drained_by}")
 
     def _count_rejection(self, sender: str, rejected: Rejected) -> None:
         self._counters.rollouts_rejected[rejected.cause] += 1

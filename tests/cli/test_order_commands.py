@@ -87,7 +87,7 @@ def test_actor_that_waits_for_a_run_is_drained(network: MemoryNetwork, capsys: p
     drain(network, "idle")
     assert {(message.order, message.actor, message.incarnation) for message in received} == {("drain", "idle", 7)}
     assert capsys.readouterr().out == "actor idle has left\n"
-    with pytest.raises(OrderError, match="^no actor 'idle' waits for a run, and no learner answers at this address"):
+    with pytest.raises(OrderError, match=r"^no actor 'idle' waits for a run, and no learner answers at this address"):
         drain(network, "idle")
 
 
@@ -116,7 +116,7 @@ def test_failures_name_what_to_do(network: MemoryNetwork) -> None:
         drain(network, run="other")
     with pytest.raises(OrderError, match=r"^no learner of run 'other' answers; the runs here are 'mine'$"):
         orders.stop_run(MemoryTransport(network), ALICE, "other", None)
-    with pytest.raises(OrderError, match="does not answer the order: .* the router does not let this certificate"):
+    with pytest.raises(OrderError, match=r"does not answer the order: .* the router does not let this certificate"):
         drain(network)
     learner.serve_orders()
     with pytest.raises(OrderError, match=r"still there after 0\.01 s: box; the order remains in force"):

@@ -309,7 +309,9 @@ def test_beyond_loopback_a_page_needs_a_token_and_orders_that_of_an_operator(
     running = RunningGateway(network, made / "gateway", follows=False)
     context = ssl.create_default_context(cafile=made / "gateway" / "ca.pem")
     orders: list[str] = []
-    running.call(lambda: setattr(running.data, "give_order", lambda *order: (orders.append(" by ".join(order)) is None, "")))
+    running.call(
+        lambda: setattr(running.data, "give_order", lambda *order: (orders.append(" by ".join(order)) is None, ""))
+    )
     try:
         for token, admitted in (("", False), ("wrong", False), (phone, True), (operator, True)):
             with connect(f"wss://127.0.0.1:{running.port}/watch", ssl=context, open_timeout=LIMIT) as socket:

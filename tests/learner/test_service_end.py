@@ -10,21 +10,21 @@ from typing import Any
 import pytest
 from log_lines import LINES
 from processes import LIMIT, until
-from session_fleet import GatedActor, LearnerProcess
+from session_fleet import GatedActor, LearnerProcess, order_to
 
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.learner.reporting import recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run import heartbeat
-from daedalus.learner.serving import actor_server, run_context, waiting_requests
+from daedalus.learner.serving import actor_server, orders, run_context
 from daedalus.learner.training import checkpointer
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.protocol import keys
-from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Message, OrderRequest, Refusal, RunStatus, StatusReport
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunStatus, StatusReport
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 ACTORS = 15
