@@ -205,7 +205,7 @@ def test_evaluator_stops_between_evaluations(network: MemoryNetwork) -> None:
 class Endless:
     """Environments whose episodes do not end, and that report when they are stepped."""
 
-    count, spaces = 2, SPACES
+    count, seats, spaces = 2, 1, SPACES
 
     def __init__(self) -> None:
         self.seeds: list[int] = []
