@@ -352,7 +352,9 @@ def comparison_section(comparison: Comparison | None) -> ET.Element:
     explained = [element("li", line) for line in notes(comparison)]
     return section(
         "Comparison",
-        table(header(comparison), rows, label="comparison of the groups", numeric=range(1, 7)),
+        table(
+            header(comparison), rows, label=f"comparison of the groups of {comparison.environment}", numeric=range(1, 7)
+        ),
         element("ul", explained, class_="muted"),
     )
 
@@ -378,7 +380,7 @@ def runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element:
                     failures or "none",
                 )
             )
-    return section("Runs", table(head, rows, label="runs", numeric=(2, 4, 5, 6, 7)))
+    return section("Runs", table(head, rows, label=f"runs of {environment_of(groups)}", numeric=(2, 4, 5, 6, 7)))
 
 
 def _evaluated(record: RunRecord) -> str:
@@ -395,7 +397,7 @@ def differences_section(groups: Sequence[Group]) -> ET.Element | None:
     if not rows:
         return None
     head = ("setting", *(group.name for group in groups))
-    return section("Settings that differ", table(head, rows, label="settings that differ"))
+    return section("Settings that differ", table(head, rows, label=f"settings of {environment_of(groups)} that differ"))
 
 
 def _values(group: Group, key: str) -> str:
