@@ -32,6 +32,7 @@ from daedalus.analysis.run_results import (
 )
 from daedalus.learner.reporting.metrics_rows import ENV, USER
 from daedalus.learner.run.run_directory import CONFIG
+from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
 from daedalus.protocol.texts import printable
 
 _STYLE = Path(__file__).with_name("report_style.css")
@@ -86,6 +87,7 @@ def run_page(group: Group[RunRecord], by: str) -> str:
         _curves([group], by),
         evaluation_section(record),
         video_section(record),
+        orders_section(record),
         failure_section(record),
         settings_section(record),
         versions_section(record),
@@ -260,6 +262,18 @@ def video_section(record: RunRecord) -> ET.Element | None:
     if video.media_type == "image/gif":
         return section("Video", element("img", src=source, alt=name, class_="video"))
     return section("Video", element("video", src=source, controls=True, loop=True, muted=True, aria_label=name))
+
+
+def orders_section(record: RunRecord) -> ET.Element | None:
+    """Return the orders of operators and who gave them; None without any."""
+    given = [each for each in record.events if each.text.startswith((ORDERED_BY, DRAINED_BY, STOPPED_BY))]
+    if not given:
+        return None
+    rows = [(each.time, each.actor or "the run", each.kind, each.text) for each in given[-_MOST_EVENTS:]]
+    more = len(given) - len(rows)
+    left_out = element("p", f"{more:,} earlier ones are in events.jsonl.", class_="muted") if more > 0 else None
+    listed = table(("at (UTC)", "about", "event", "order"), rows, label="orders of operators")
+    return section("Orders of operators", listed, left_out)
 
 
 def failure_section(record: RunRecord) -> ET.Element:

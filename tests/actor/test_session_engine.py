@@ -144,7 +144,7 @@ def test_actor_that_is_drained_while_it_sends_nothing_ends() -> None:
     played.verdict = None
     played.go(lambda: len(rollouts(played)) == 2)
     played.learners["r"] = refusal("drained")
-    with pytest.raises(RunOverError, match="an operator drained this actor"):
+    with pytest.raises(RunOverError, match=r"^why: this actor leaves the run$"):
         played.go(lambda: False)
 
 
