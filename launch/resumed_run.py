@@ -1,6 +1,7 @@
 """What `daedalus resume` and `daedalus.resume` continue: the settings of a run with changes, and its environment."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,11 @@ from daedalus.launch.environment_check import checked_spaces
 from daedalus.launch.local_run import LocalRun
 from daedalus.launch.run_choice import with_record
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.resuming import FinishedRun, finished_run, initial_to_resume, with_changes
+from daedalus.learner.run.resuming import FinishedRun, finished_run, initial_to_resume, other_spaces, with_changes
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.saving.saved_policy import checkpoints
+from daedalus.policy.saving.saved_policy import NoPolicyError, checkpoints, find_policy
+from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import RunSpec
@@ -85,6 +87,10 @@ def resumed_run(
     # Modules may be of another folder, and objects others than before.
     is_known = checkpoints(choice.directory) and not (environment.user_modules or environment.is_from_python)
     spaces = None if is_known else checked_spaces(spec, fork=fork)
+    if spaces is not None:
+        with suppress(NoPolicyError, DamagedError):  # the learner reports a damaged checkpoint
+            if difference := other_spaces(find_policy(choice.directory, newest=True), environment, spaces):
+                raise SettingsError(f"the environment is another than that of the run: {difference}")
     run_directory.write_config(choice.directory, spec)
     return LocalRun(
         directory=lock.directory,

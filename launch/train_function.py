@@ -25,6 +25,7 @@ from daedalus.learner.reporting.trackers.tracker import tracker_name
 from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.resuming import FinishedRun
+from daedalus.learner.run.run_lock import RunInUseError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, refuse_while_imported
 from daedalus.transport.private_address import private_address
@@ -175,8 +176,8 @@ def resume(
       callback, log, quiet: see `train`. The trackers of the run go on in any case.
 
     Returns the recorded result of a run that has nothing left to train. Raises as `train` does, SettingsError also for
-    a directory without a run, another environment and modules that are not allowed, and RunInUseError if a process has
-    the run.
+    a directory without a run, another environment and modules that are not allowed, and TrainingError also if another
+    process has the run.
     """
     started = time.monotonic()
     refuse_while_imported("daedalus.resume")
@@ -205,6 +206,8 @@ def resume(
             raise SettingsError(f"{error.reason}; {remedy}") from None
         except UserModuleError as error:
             raise SettingsError(str(error)) from None
+        except RunInUseError as error:
+            raise TrainingError(str(error)) from None
         with lock, _checking(quiet):
             run = resumed_run(choice, spec, lock, init_from, started=started)
             if isinstance(run, FinishedRun):

@@ -3,7 +3,7 @@
 import importlib
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -19,7 +19,7 @@ from daedalus.actor.environments.environment_errors import (
     unknown_to_gymnasium,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-from daedalus.actor.environments.given_environment import given_environment
+from daedalus.actor.environments.given_environment import Maker, given_environment
 from daedalus.actor.environments.gymnasium_environments import EnvironmentsInTurn, GymnasiumEnvironments
 from daedalus.actor.environments.info import has_choices
 from daedalus.actor.environments.rendering import CountedSteps, render_without_display
@@ -195,7 +195,7 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
     except gymnasium.error.Error:
         entry: Any = None if own is None else object_of(own, name)
         if callable(entry):
-            return EnvSpec(id=name, entry_point=entry)
+            return EnvSpec(id=name, entry_point=cast(Maker, entry))
         raise (unknown_to_gymnasium(name) if own is None else not_registered(name, own)) from None
 
 
