@@ -42,7 +42,7 @@ def example(guide: str, language: str = "python", number: int = 0) -> str:
 
 def test_the_environment_can_be_played(folder: Path) -> None:
     (folder / "corridor.py").write_text(example("environment.md"))
-    (folder / "corridor_wrappers.py").write_text(example("environment.md", number=1))
+    (folder / "corridor_wrappers.py").write_text(example("environment.md", number=2))
     spec = EnvironmentSpec(id="corridor:Corridor-v0", kwargs={"cells": 8}, wrap="corridor_wrappers:step_costs")
     environments = PlainEnvironments(make_environments(spec, 2, modules=TEST_MODULES))
     assert choices(environments.spaces) == 2
