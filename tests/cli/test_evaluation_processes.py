@@ -22,7 +22,7 @@ from daedalus.launch.final_evaluation import EvaluationFailedError, play
     ],
 )
 def test_a_process_that_ends_without_a_result_is_named(tmp_path: Path, program: str, reason: str) -> None:
-    def start(_module: str, *_arguments: str, streams: Streams, one_thread: bool = False) -> subprocess.Popen[bytes]:
+    def start(module: str, *arguments: str, streams: Streams, one_thread: bool = False) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-S", "-c", program]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=streams.stdout, stderr=streams.stderr)
 
