@@ -92,7 +92,7 @@ def test_the_algorithm_learns(folder: Path) -> None:
 
 
 def test_the_value_loss_of_the_clipped_algorithm_is_that_of_the_paper(folder: Path) -> None:
-    """Engstrom et al. (2020), section 3, row by row. A value has no gradient where its clipped error is the worse one."""
+    """Engstrom et al. (2020), section 3, row by row. Where the clipped error is the worse one, there is no gradient."""
     (folder / "my_ppo.py").write_text(example("algorithm.md", number=1))
     modules = UserModules(frozenset({"my_ppo"}))
     training = {"algorithm": "my_ppo:ValueClipped", "algorithm_kwargs": {"value_clip": 0.5}, "passes": 2}
