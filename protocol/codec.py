@@ -52,7 +52,7 @@ def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[st
             packed[name] = pack(item, f"{path}{name}.", arrays)
         elif isinstance(item, BaseModel):
             packed[name] = item.model_dump(mode="json")
-        elif item is not None or name != "game_steps":  # what few rollouts have costs the others nothing
+        elif item is not None or name not in _optional(type(value)):
             packed[name] = item
     return packed
 
