@@ -52,7 +52,7 @@ def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[st
             packed[name] = pack(item, f"{path}{name}.", arrays)
         elif isinstance(item, BaseModel):
             packed[name] = item.model_dump(mode="json")
-        elif item is not None or name not in _optional(type(value)):
+        elif item is not None or name not in _sparse(type(value)):
             packed[name] = item
     return packed
 
@@ -117,6 +117,12 @@ def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray])
 def _fields(cls: type) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+@functools.cache
+def _sparse(cls: type) -> frozenset[str]:
+    """Return the names of the fields that are not sent while they are None: few messages have them."""
+    return frozenset(field.name for field in dataclasses.fields(cls) if field.metadata.get("sparse"))
 
 
 @functools.cache

@@ -76,7 +76,8 @@ class Rollout:
     # By name [n] float64, or float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
-    game_steps: int | None = None  # env_steps of a game with several agents, at most its rows to learn from
+    # Env_steps of a game with several agents, at most its rows to learn from; None: each of them is one.
+    game_steps: int | None = field(default=None, metadata={"sparse": True})
 
     @property
     def nbytes(self) -> int:
