@@ -11,7 +11,7 @@ from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunStatus
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
-from daedalus.transport.connecting import connect_until_interrupted
+from daedalus.transport.connecting import connect_once
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.status_query import ask, decoded, newest_of_each_run, no_answer
@@ -60,7 +60,7 @@ def drain(arguments: list[str]) -> int:
         print_error("drain", error)
         return status_at_start(error)
     try:
-        transport = connect_until_interrupted(parsed.connect, credentials)
+        transport = connect_once(parsed.connect, credentials, parsed.timeout)
         try:
             drain_actors(transport, parsed.run, names, parsed.timeout)
         except KeyboardInterrupt:
