@@ -5,7 +5,6 @@ import threading
 from collections.abc import Callable, Iterator
 
 from daedalus.gateway.watching.learner_source import LearnerSource
-from daedalus.learner.reporting.progress import StepRate
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import MetricsReport, RunStatus
@@ -22,20 +21,18 @@ class WatchedRun:
     def __init__(self, status: RunStatus) -> None:
         self.status = status
         self.returns: list[float] = []  # mean of the newest episodes, from the begin of the run on
-        self.rate = 0.0  # env_steps per second, over the last seconds
         self.next_row = 0  # of the metrics, not seen yet
-        self._meter = StepRate()
 
     @property
     def seconds_left(self) -> float | None:
         """Seconds until the budget is used up, or None if it is not known. A run may reach its target before."""
         left = self.status.env_steps_budget - self.status.env_steps
-        return max(left, 0) / self.rate if self.rate > 0.0 else None
+        rate = self.status.env_steps_per_second
+        return max(left, 0) / rate if rate > 0.0 else None
 
     def add_status(self, status: RunStatus) -> None:
         """Take a newer status of the same learner."""
         self.status = status
-        self.rate = self._meter.add(status.uptime_seconds, status.env_steps) or status.env_steps_per_second
 
     def add_rows(self, report: MetricsReport) -> None:
         """Take further rows of the metrics."""

@@ -95,6 +95,11 @@ class MetricsServer(ThreadingMixIn, WSGIServer):
         """Say nothing of a client that has left or was too slow."""
 
 
+def _known_rate(run: RunStatus, rate: float) -> float | None:
+    """Return a rate, or None while the first batch is awaited: 0 means that no update comes any more."""
+    return rate or (0.0 if run.problems else None)
+
+
 _Family = type[CounterMetricFamily] | type[GaugeMetricFamily]
 
 _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], ...] = (
@@ -111,16 +116,33 @@ _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], 
         GaugeMetricFamily,
         "env_steps_per_second",
         "Recent environment steps per second.",
-        lambda run: run.env_steps_per_second,
+        lambda run: _known_rate(run, run.env_steps_per_second),
     ),
     (CounterMetricFamily, "updates", "Optimiser steps.", lambda run: run.updates),
-    (GaugeMetricFamily, "updates_per_second", "Recent optimiser steps per second.", lambda run: run.updates_per_second),
+    (
+        GaugeMetricFamily,
+        "updates_per_second",
+        "Recent optimiser steps per second.",
+        lambda run: _known_rate(run, run.updates_per_second),
+    ),
     (CounterMetricFamily, "updates_skipped", "Updates skipped: gradient not finite.", lambda run: run.updates_skipped),
     (
         GaugeMetricFamily,
         "episode_return_mean",
         "Mean return of the newest episodes.",
         lambda run: run.episode_return_mean,
+    ),
+    (
+        GaugeMetricFamily,
+        "learning_share",
+        "Recent share of the time in which the learner computed updates.",
+        lambda run: run.learning_share,
+    ),
+    (
+        GaugeMetricFamily,
+        "decoding_share",
+        "Recent share of the time in which the learner decoded rollouts.",
+        lambda run: run.decoding_share,
     ),
     (GaugeMetricFamily, "policy_lag_updates", "Recent mean policy lag.", lambda run: run.policy_lag_mean),
     (CounterMetricFamily, "rollouts_accepted", "Rollouts accepted.", lambda run: run.rollouts_accepted),
@@ -147,8 +169,32 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
     (
         GaugeMetricFamily,
         "actor_silence_seconds",
-        "Time since the learner last heard from the actor.",
+        "Time since the last sign of life of the actor: a rollout or a report.",
         lambda actor: actor.seconds_since_seen,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_silence_limit_seconds",
+        "Silence above it is unusual for this actor.",
+        lambda actor: actor.silence_limit_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_rollout_seconds",
+        "Duration of one of its newest rollouts; 0: unknown.",
+        lambda actor: actor.rollout_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_waiting_seconds",
+        "Its wait from one rollout to the next.",
+        lambda actor: actor.waiting_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_round_trip_seconds",
+        "Round trip of a small request; 0: unknown.",
+        lambda actor: actor.round_trip_seconds,
     ),
     (GaugeMetricFamily, "actor_environments", "Environments of the actor.", lambda actor: actor.environments),
     (

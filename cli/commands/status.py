@@ -19,7 +19,7 @@ from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
-from daedalus.protocol.texts import one_line, printable, short_number
+from daedalus.protocol.texts import one_line, printable, short_duration, short_number, short_rate
 from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
@@ -42,7 +42,8 @@ examples:
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
 epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts rollouts, MB/h down
-counts snapshots. An s marks an actor that fetches compact snapshots.
+counts snapshots. An s marks an actor that fetches compact snapshots. rollout is how long an actor takes for one, waits
+how long it then waits for the learner and the network, trip the round trip of a small request.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
 0 alive, not begun or ended, 1 not alive or no run directory"""
@@ -214,15 +215,16 @@ def _table(status: RunStatus) -> list[str]:
         *_expiry(status.certificate_days_left),
         f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}, "
         f"updates {status.updates:,}{skipped}",
-        f"  {status.env_steps_per_second:,.0f} env_steps/s, {status.updates_per_second:,.1f} updates/s, "
+        *([f"  {status.bottleneck}"] if status.bottleneck else []),
+        f"  {short_rate(status.env_steps_per_second)} env_steps/s, {short_rate(status.updates_per_second)} updates/s, "
         f"policy lag {status.policy_lag_mean:.1f}",
         f"  actors: {status.actors_alive:,} alive, {status.actors_quarantined:,} quarantined, {status.actors_gone:,} "
         f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
         f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'epsilon':>7} {'env_steps':>13} {'/s':>8}"
-        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}"
-        "  rejected; host, address, software",
+        f" {'lag':>4} {'rollout':>7} {'waits':>7} {'trip':>7} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8}"
+        f" {'down':>8}  rejected; host, address, software",
         *(f"  {_line(actor)}" for actor in status.actors),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
@@ -266,6 +268,10 @@ def _missing_actors(status: RunStatus) -> list[str]:
     return [f"  ... and {missing:,} more, which the learner did not report in time"] if missing > 0 else []
 
 
+def _measured(seconds: float) -> str:
+    return short_duration(seconds) if seconds else "-"
+
+
 def _line(actor: ActorStatus) -> str:
     state = "quarantined" if actor.quarantined else "alive" if actor.alive else "gone"
     rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
@@ -275,7 +281,9 @@ def _line(actor: ActorStatus) -> str:
     epsilon = f"{actor.epsilon:g}" if actor.epsilon else "-"
     return (
         f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
-        f" {epsilon:>7} {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
-        f" {actor.busy_answers / max(answers, 1):>5.0%} {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
+        f" {epsilon:>7} {actor.env_steps:>13,} {short_rate(actor.env_steps_per_second):>8} {actor.policy_lag:>4}"
+        f" {_measured(actor.rollout_seconds):>7} {_measured(actor.waiting_seconds):>7}"
+        f" {_measured(actor.round_trip_seconds):>7} {actor.busy_answers / max(answers, 1):>5.0%}"
+        f" {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
         f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}; {where or '-'}"
     )

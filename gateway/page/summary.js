@@ -42,6 +42,7 @@ export class Summary {
     const plays = /^CartPole-v[01]$/.test(status.environment) && state !== "ended";
     byId("play").hidden = !plays || !this.takesClients;
     this.#progress(status);
+    setText(byId("bottleneck"), state === "running" ? status.bottleneck : "");
     this.tiles();
     document.title = `${status.run}: ${number(status.episode_return_mean)} - Daedalus`;
   }
@@ -92,7 +93,7 @@ export class Summary {
       evaluated === null ? "none yet" : `± ${number(metrics.newest("evaluation_return_std"))} at ${number(evaluated)} env_steps`,
     );
     this.#tile("env_steps/s", number(status.env_steps_per_second), `${number(status.updates_per_second)} updates/s`);
-    this.#tile("Policy lag", number(status.policy_lag_mean), "updates, mean of the last second");
+    this.#tile("Policy lag", number(status.policy_lag_mean), "updates, mean of the newest batches");
     const absent = [[status.actors_quarantined, "quarantined"], [status.actors_gone, "gone"]];
     const others = absent.filter(([count]) => count).map(([count, what]) => `${whole(count)} ${what}`);
     this.#tile("Actors", whole(status.actors_alive), others.join(", ") || "none gone");

@@ -342,7 +342,9 @@ class RolloutIntake:
                 break
             arrived, request = taken
             sender, payload = keys.last_chunk(request.key), request.payload
+            began = time.monotonic()
             content = self._judge.read(sender, payload)
+            self._counters.decoding_seconds += time.monotonic() - began
             with self._lock:
                 too_fast = self._judge.is_too_fast(content, time.monotonic())
             if too_fast or not self._wait_for_room(content, arrived + LATE_SECONDS):
