@@ -229,6 +229,7 @@ class RunStatus(Specification):
     actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
+    updates_per_batch: int = 1  # by which a policy lag in updates is one in batches
     bottleneck: str = ""  # what the run waits for, in one line for a person; empty if it is not known yet
     learning_share: float = 0.0  # of the time in which the learner computes updates
     decoding_share: float = 0.0  # of the time in which the learner decodes rollouts

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import TextIO
 
-from daedalus.protocol.texts import short_number, short_rate
+from daedalus.protocol.texts import policy_lag, short_number, short_rate
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
@@ -20,9 +20,9 @@ _logger = logging.getLogger(__name__)
 class Progress:
     """Display of the newest metrics row."""
 
-    def __init__(self, stream: TextIO, env_steps_budget: int) -> None:
+    def __init__(self, stream: TextIO, env_steps_budget: int, updates_per_batch: int = 1) -> None:
         self._stream = stream
-        self._budget = env_steps_budget
+        self._budget, self._updates_per_batch = env_steps_budget, updates_per_batch
         self._terminal = is_terminal(stream)
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
         self._rewriting = False
@@ -33,7 +33,7 @@ class Progress:
             if time.monotonic() < self._next_line:
                 return
             self._next_line = time.monotonic() + _LINE_SECONDS
-        parts = _parts(row, self._budget)
+        parts = _parts(row, self._budget, self._updates_per_batch)
         if self._terminal:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
             self._write(f"\r\x1b[K{line}")
@@ -70,10 +70,11 @@ def is_terminal(stream: TextIO) -> bool:
     return stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
 
 
-def _parts(row: Mapping[str, float], budget: int) -> list[str]:
+def _parts(row: Mapping[str, float], budget: int, updates_per_batch: int) -> list[str]:
     """Return the parts of a line, the most important first. What is not known yet is a dash."""
     rate, updates = row.get("env_steps_per_second", 0.0), row.get("updates_per_second")
     mean = short_number(row["episode_return_mean"]) if "episode_return_mean" in row else "-"
+    lag = policy_lag(row["policy_lag_mean"], updates_per_batch) if "policy_lag_mean" in row else "-"
     left = duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
     parts = [
         f"{row['wall_seconds']:7.1f} s",
@@ -82,7 +83,7 @@ def _parts(row: Mapping[str, float], budget: int) -> list[str]:
         f"{short_rate(rate) if rate else '-':>7}/s",
         f"left {left:>6}",
         f"updates {'-' if updates is None else short_rate(updates):>5}/s",
-        f"lag {format(row['policy_lag_mean'], '.1f') if 'policy_lag_mean' in row else '-'}",
+        f"lag {lag}",
         f"actors {row['actors']}",
     ]
     if "episode_length_mean" in row:

@@ -181,6 +181,7 @@ class RunReporter:
             **totals(fleet),
             refused_joins=fleet.refused_joins.report(now),
             actors=page(fleet, "", now),
+            updates_per_batch=spec.training.updates_per_batch,
             bottleneck=self._bottleneck,
             learning_share=rates.learning_share,
             decoding_share=rates.decoding_share,
