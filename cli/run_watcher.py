@@ -3,13 +3,14 @@
 import math
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 from daedalus.gateway.watching.learner_source import LearnerSource
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import MetricsReport, RunStatus
 from daedalus.transport.interface import RefusedError, Transport, TransportError
-from daedalus.transport.status_query import ask
+from daedalus.transport.status_query import survey
 
 _RETURN = "episode_return_mean"
 _MAX_RETURNS = 4096  # then every second one is dropped
@@ -60,18 +61,24 @@ class RunWatcher:
         self._runs: dict[int, WatchedRun] = {}  # by learner epoch
 
     def look(self) -> list[WatchedRun]:
-        """Return the runs whose learners answer. Raises TransportError or ProtocolError."""
+        """Return the runs whose learners can be read; the others are logged once. Raises TransportError."""
         runs: dict[int, WatchedRun] = {}
-        for status in ask(self._transport, self._run, max_actors=MAX_ACTORS):
+        found = survey(self._transport, self._run, max_actors=MAX_ACTORS)
+        found.log()
+        for status in found.statuses:
             run = runs[status.learner_epoch] = self._runs.get(status.learner_epoch) or WatchedRun(status)
             run.add_status(status)
-            for _ in range(_MOST_PAGES):
-                report = self._source.metrics(status, run.next_row)
-                if report is None or not len(report.numbers):
-                    break
-                run.add_rows(report)
+            with suppress(ProtocolError):  # of another release: without its curve
+                self._add_rows(run)
         self._runs = runs
         return sorted(runs.values(), key=lambda run: run.status.run)
+
+    def _add_rows(self, run: WatchedRun) -> None:
+        for _ in range(_MOST_PAGES):
+            report = self._source.metrics(run.status, run.next_row)
+            if report is None or not len(report.numbers):
+                break
+            run.add_rows(report)
 
 
 def looks(
@@ -101,8 +108,6 @@ def looks(
             while not stop.is_set() and (runs := watcher.look()):
                 yield runs
                 stop.wait(seconds)
-        except ProtocolError as error:
-            raise TransportError(f"the answer of the learner is damaged: {error}") from None
         except RefusedError:
             raise
         except TransportError:

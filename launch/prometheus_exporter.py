@@ -18,14 +18,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import FAILED
-from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall
-from daedalus.transport.status_query import ask, newest_of_each_run
+from daedalus.transport.status_query import Survey, newest_of_each_run, survey
 
 _logger = logging.getLogger(__name__)
 
@@ -233,8 +232,10 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
 )
 
 
-def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
+def metrics(statuses: Iterable[RunStatus], unread: Iterable[str] = ()) -> Iterator[Metric]:
     """Yield all metrics of the runs that answered, or only `daedalus_up` 0 if no run answered.
+
+    `unread` are runs whose learners answered, but cannot be read: they have one metric.
 
     Actors that are gone have no series of their own. They are only counted, by their state, and after a minute only in
     the counters of the run. Of several learners of one run, the newest has series.
@@ -242,6 +243,10 @@ def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
     statuses = list(statuses)
     runs = newest_of_each_run(statuses)
     yield GaugeMetricFamily("daedalus_up", "1 if a learner answers, else 0.", value=bool(runs))
+    others = GaugeMetricFamily("daedalus_unreadable", "1 for a run whose learner cannot be read.", labels=["run"])
+    for name in unread:
+        others.add_metric([name], 1)
+    yield others
     info = GaugeMetricFamily(
         "daedalus_run_info", "Environment and algorithm of the run.", labels=["run", "environment", "algorithm"]
     )
@@ -285,13 +290,14 @@ class StatusCollector:
 
     def collect(self) -> Iterator[Metric]:
         """Query the learners and return their metrics."""
-        statuses = []
+        found = Survey(statuses=[], unread={})
         if self.transport is not None:
-            with contextlib.suppress(TransportError, ProtocolError):
-                statuses = ask(self.transport, max_actors=_MAX_ACTORS)
-        self.unanswered = not statuses
-        self._warn_of_large_fleet(statuses)
-        return metrics(statuses)
+            with contextlib.suppress(TransportError):
+                found = survey(self.transport, max_actors=_MAX_ACTORS)
+        self.unanswered = not found.statuses and not found.unread
+        found.log()
+        self._warn_of_large_fleet(found.statuses)
+        return metrics(found.statuses, found.unread)
 
     def _warn_of_large_fleet(self, statuses: list[RunStatus]) -> None:
         """Warn once if not all actors have series of their own."""

@@ -24,7 +24,7 @@ from daedalus.protocol.texts import one_line, policy_lag, printable, short_durat
 from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.status_query import ask, ask_events, no_answer
+from daedalus.transport.status_query import ask_events, no_answer, survey
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
 _FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0  # between two looks
@@ -102,16 +102,20 @@ def status(arguments: list[str]) -> int:
             return _watch(parsed, credentials)
         transport = connect_until_interrupted(parsed.connect, credentials)
         try:
-            statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
+            found = survey(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
+            statuses = found.statuses
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
-            unanswered = "" if statuses else no_answer(transport, parsed.run)
+            unanswered = "" if statuses or found.unread else no_answer(transport, parsed.run)
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
         print_error("status", error)
         return NO_ANSWER
+    for line in found.left_out:
+        print_error("status", line)
     if not statuses:
-        print_error("status", unanswered)
+        if unanswered:
+            print_error("status", unanswered)
         return NO_ANSWER
     if parsed.quiet:
         _show_problems(statuses)
@@ -142,7 +146,7 @@ def watch_status(
       text: returns what is printed about a run where no frames are shown.
       frames: redraw one frame.
 
-    Raises TransportError if the learner refuses this process, or if its answers are damaged.
+    Raises TransportError if the learner refuses this process.
     """
     wanted = "no learner" if run == keys.ANY_RUN else f"no learner of run {run!r}"
     nobody, waiting = f"{wanted} answers at this address; waiting for one (Ctrl-C ends)", False
