@@ -39,7 +39,7 @@ def slow(seconds: float) -> list[tuple[str, str]]:
             )
             statuses.append(shown.returncode)
             for line in shown.stdout.splitlines():
-                if "PROBLEM" in line or "-bound" in line or "waits" in line.partition(":")[0]:
+                if "PROBLEM" in line or "-bound:" in line or "the first batch" in line:
                     lines.add(re.sub(r"row [\d,]+", "row N", line.strip()))
             scraped = _scrape(url)
             updates.append(scraped["daedalus_updates_total"][0])

@@ -168,11 +168,15 @@ HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
         ({"updated": 44.0, "awaited_since": 44.0}, 1, ("no update for 61 s",)),
         ({"updated": 44.0, "actor_seen": 44.0}, 0, ("no live actor for 61 s",)),
         ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
-        ({"left_out": {"b", "a"}}, 3, ("batches do not wait for a, b: connected, but without rollouts",)),
+        (
+            {"left_out": {"b", "a"}},
+            3,
+            ("batches do not wait for a, b: connected, but far slower than the others, or hung",),
+        ),
         (
             {"left_out": set("abcdefg")},
             9,
-            ("batches do not wait for a, b, c, d, e and 2 more: connected, but without rollouts",),
+            ("batches do not wait for a, b, c, d, e and 2 more: connected, but far slower than the others, or hung",),
         ),
         (
             {"far_outside": {"b": ("returns", 50.0), "a": ("observations/position", 60.0), "c": ("returns", 44.0)}},
