@@ -309,8 +309,8 @@ class RolloutIntake:
         for name in sorted(self._buffer.left_out - self._named):
             self._named.add(name)
             _logger.warning(
-                "batches no longer wait for actor %r, which is connected but far slower than the others, or hung: examine "
-                "its environment",
+                "batches no longer wait for actor %r, which is connected but far slower than the others, or hung: "
+                "examine its environment",
                 name,
             )
         return taken

@@ -97,9 +97,8 @@ class Health:
         if self.left_out:
             names = sorted(self.left_out)
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            found.append(
-                f"batches do not wait for {', '.join(names[:5])}{more}: connected, but far slower than the others, or hung"
-            )
+            who = f"{', '.join(names[:5])}{more}"
+            found.append(f"batches do not wait for {who}: connected, but far slower than the others, or hung")
         far = {name: each for name, (each, last) in self.far_outside.items() if now - last < _FAR_SECONDS}
         if far:
             names = [f"{name} ({component})" for name, component in sorted(far.items())]
