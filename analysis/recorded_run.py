@@ -27,7 +27,7 @@ from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.protocol.spec import EnvironmentSpec
-from daedalus.protocol.texts import without_secrets
+from daedalus.protocol.texts import bounded_text, without_secrets
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
@@ -343,6 +343,12 @@ class RunRecord(RecordedRun):
         if self.unfinished:
             return "not finished"
         return "solved" if self.summary.get("solved") else "finished"
+
+    @property
+    def bottleneck(self) -> str:
+        """What the run waited for, in one line; empty if it is not known."""
+        text = self.summary.get("bottleneck")
+        return bounded_text(text) if isinstance(text, str) else ""
 
     @property
     def rejected(self) -> dict[str, int]:

@@ -101,8 +101,8 @@ class ActorService:
         return None
 
     def _on_row(self) -> None:
-        if self._session.is_fetch_due(time.monotonic()):
-            self._thread.call(self._session.fetch_next)
+        if self._session.begin_row(time.monotonic()):
+            self._thread.call(self._session.act_in_rollout)
         else:
             self._thread.call_after_events(self._session.check_over)
 

@@ -302,7 +302,7 @@ class ActorServer:
         request.reply(self._joins.join(name, request.payload, time.monotonic()))
 
     def _on_report(self, request: Request) -> None:
-        request.reply(self._joins.report(keys.last_chunk(request.key), request.payload))
+        request.reply(self._joins.report(keys.last_chunk(request.key), request.payload, time.monotonic()))
 
     def _on_drain(self, request: Request) -> None:
         name = keys.last_chunk(request.key)
