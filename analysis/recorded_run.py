@@ -81,7 +81,9 @@ class RecordedRun:
         running = is_locked(self.directory)
         command = f"daedalus resume {shlex.quote(str(self.directory))}"
         remedy = "it is still running" if running else f"continue it with: {command}"
-        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
+        author = self.summary.get("stopped_by")
+        stopped = f", stopped by {bounded_text(author)}" if isinstance(author, str) and not running else ""
+        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps){stopped}: {remedy}"
 
     @property
     def evaluation_return(self) -> float | None:

@@ -12,9 +12,11 @@ from typing import Literal
 
 import numpy as np
 
+from daedalus.protocol import keys
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import EPISODE_DTYPES, Gradient, Rollout
 
 
@@ -47,18 +49,42 @@ class ClientReport:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be 0 or more")
 
 
-Order = Literal["stop", "checkpoint"]
+Order = Literal["stop", "checkpoint", "drain"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderRequest:
-    """Order of an operator. Operator -> learner, on `orders`. The answer is an Acknowledgement `accepted`.
+    """Order of an operator to one process, on `orders/{operator}`.
+
+    Operator -> learner, which answers with an Acknowledgement `accepted` or a Refusal; it carries an order out once,
+    and only if the order names its run and its epoch. Operator -> actors that wait for a run, as a publication: the
+    actor of that name and incarnation leaves.
 
     stop: save a checkpoint and end; the run can be resumed.
     checkpoint: save a checkpoint now.
+    drain: ask an actor to leave after its current rollout.
     """
 
     order: Order
+    run: str = ""  # of the learner
+    learner_epoch: int = 0  # likewise
+    number: int = 0  # at random: no other order to this learner has it
+    actor: str = ""  # that is drained
+    incarnation: int = 0  # of an actor that waits for a run
+    # Who gives the order, besides the operator's name in the key, as the sender states it.
+    host: str = ""
+    token: str = ""  # whose token the page of a gateway sent, such as `operator alice`; empty if it is not from a page
+
+    def author(self, operator: str) -> str:
+        """Return who gives the order, for a person; `operator` is the name in the key."""
+        host = f" at {bounded_text(self.host, MAX_NAME)}" if self.host else ""
+        named = operator != keys.NO_OPERATOR
+        if self.token:
+            gateway = f" of operator {bounded_text(operator, MAX_NAME)}" if named else ""
+            return f"the token of {bounded_text(self.token, 2 * MAX_NAME)}, on the page of the gateway{gateway}{host}"
+        if named:
+            return f"operator {bounded_text(operator, MAX_NAME)}{host}"
+        return f"the operator{host}, without an operator's certificate"
 
 
 MAX_PAGE_VALUES = 1 << 16  # numbers in one page
@@ -156,6 +182,7 @@ class ActorStatus(Specification):
     waiting_seconds: float = 0.0
     round_trip_seconds: float = 0.0
     silence_limit_seconds: float = 60.0  # `seconds_since_seen` above it is unusual for this actor
+    drained_by: str = ""  # who ordered it to leave; empty if nobody did
 
 
 class RefusedJoin(Specification):
@@ -233,6 +260,7 @@ class RunStatus(Specification):
     bottleneck: str = ""  # what the run waits for, in one line for a person; empty if it is not known yet
     learning_share: float = 0.0  # of the time in which the learner computes updates
     decoding_share: float = 0.0  # of the time in which the learner decodes rollouts
+    last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
 
     @property
     def fleet_size(self) -> int:
@@ -316,7 +344,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement:
-    """Verdict on a rollout or gradient, a report, an order, or a request on `drain/{actor}`. Learner -> sender.
+    """Verdict on a rollout or gradient, a report, or an order. Learner -> sender.
 
     accepted: it will be trained on, unless the learner ends first or its policy lag exceeds the bound.
     busy: the learner's queue is full; send it again later.

@@ -99,8 +99,10 @@ def _remedy(key: str, error: ProtocolError) -> str:
             return f"what answers for its learner is not one ({error}): find out which process serves {key}"
 
 
-def decoded(answers: Iterable[bytes], kind: type[_Kind], limits: Limits = STATUS_LIMITS) -> list[_Kind]:
-    """Return the messages of a kind among the answers of several learners.
+def decoded(
+    answers: Iterable[bytes], kind: type[_Kind] | tuple[type[_Kind], ...], limits: Limits = STATUS_LIMITS
+) -> list[_Kind]:
+    """Return the messages of a kind, or of several, among the answers of several learners.
 
     One that cannot be read, such as that of another release, is logged and ignored. Raises ProtocolError if no answer
     can be read.
@@ -172,6 +174,16 @@ def _of_run(status: RunStatus, answers: list[bytes], kind: type[_Kind]) -> list[
     except ProtocolError as error:
         _warn(f"run {status.run!r} is shown in part: {_remedy(keys.status(status.run), error)}")
         return []
+
+
+def waiting_actors(transport: Transport) -> dict[str, list[int]]:
+    """Return the names and incarnations of the actors that wait for a run. Raises TransportError."""
+    found: dict[str, list[int]] = {}
+    for key in transport.present(keys.presence(keys.NO_RUN, "*", "*")):
+        parsed = keys.parse_presence(key)
+        if parsed is not None and keys.is_name(parsed[0]):
+            found.setdefault(parsed[0], []).append(parsed[1])
+    return dict(sorted(found.items()))
 
 
 def _with_actors(transport: Transport, status: RunStatus, max_actors: int | None) -> RunStatus:

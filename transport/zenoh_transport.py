@@ -87,6 +87,7 @@ def _remove_from(descriptor: int) -> None:
 _logger = logging.getLogger(__name__)
 
 _CLOSE_SECONDS = 2.0  # Zenoh waits up to 10 s for a router that does not answer
+_PRESENT_SECONDS = 5.0  # for a query of presence
 _PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
 _RENEW_SECONDS, _RENEW_PAUSE_SECONDS = 10.0, 0.05  # for the address of a closed session to become free
 
@@ -281,6 +282,12 @@ class ZenohTransport:
 
         with _as_transport_error(f"watch presence under {key}"):
             self._declarations.add(declare)
+
+    def present(self, key: str) -> list[str]:
+        """See Transport."""
+        with _as_transport_error(f"query presence under {key}"):
+            replies = self._session.liveliness().get(key, timeout=_PRESENT_SECONDS)
+            return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def reopen(self, unless_served: str | None = None) -> bool:
         """See Transport. A router is never reopened: its address would still be in use by itself."""

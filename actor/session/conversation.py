@@ -23,9 +23,20 @@ from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, UnfitMessageError, VersionMismatchError, decode, encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, LEARNER_LIMITS
-from daedalus.protocol.messages import UNKNOWN, Join, Message, Origin, Program, Refusal, RunEnded, Welcome, starts_of
+from daedalus.protocol.messages import (
+    UNKNOWN,
+    Join,
+    Message,
+    OrderRequest,
+    Origin,
+    Program,
+    Refusal,
+    RunEnded,
+    Welcome,
+    starts_of,
+)
 from daedalus.protocol.spec import UnsupportedRunError
-from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
+from daedalus.protocol.texts import MAX_ANSWER_TEXT, MAX_NAME, bounded_text
 
 _logger = logging.getLogger(__name__)
 
@@ -39,7 +50,7 @@ _STEP_DOWN_SECONDS = 5.0  # for the older of two learners of a run to notice the
 _REOPEN_SECONDS = 5.0  # without an answer for so long, the session may be dead: open another
 _SILENCE_SECONDS = 10.0  # without a message for so long, ask whether the learner is there
 
-DRAINED = "an operator drained this actor: it leaves the run"
+WAITING_ORDERS = keys.orders(keys.NO_RUN, "*")  # to actors that wait for a run
 
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Any, Any, Result]  # yields actions, is sent what came of each, returns a result
@@ -117,7 +128,14 @@ class DeclarePresence:
     key: str
 
 
-AtOnce: TypeAlias = Query | Subscribe | Unsubscribe | WatchPresence | DeclarePresence
+@dataclass(frozen=True, slots=True)
+class WithdrawPresence:
+    """Be present under a key no longer. Idempotent."""
+
+    key: str
+
+
+AtOnce: TypeAlias = Query | Subscribe | Unsubscribe | WatchPresence | DeclarePresence | WithdrawPresence
 
 
 class RunOverError(Exception):
@@ -138,6 +156,8 @@ class Conversation:
       heard_at: the time of the last message of the learner.
     """
 
+    is_actor = True  # whether operators may see that it waits for a run, and drain it then
+
     def __init__(self, config: ActorConfig, origin: Origin = UNKNOWN) -> None:
         """`origin` says where this process runs, for the operator who reads the status."""
         self.config = config
@@ -151,17 +171,27 @@ class Conversation:
         self._learner_stopped = False  # since `follow`
         self._actions: list[AtOnce] = []
         self._noted = ""  # the last warning of another release
+        self._waits = False  # whether it shows that it waits for a run
 
     # ------------------------------------------------------------------------------------------------ events
 
     def received(self, key: str, data: bytes) -> None:
         """Receive the newest value of a key that is subscribed to."""
-        if key != keys.run_end(self.run):
+        if key not in (WAITING_ORDERS, keys.run_end(self.run)):
             return
         with contextlib.suppress(ProtocolError):
             message = decode(data, ACKNOWLEDGEMENT_LIMITS)
-            if isinstance(message, RunEnded):
+            if isinstance(message, RunEnded) and key != WAITING_ORDERS:
                 self.run_ended(message)
+            if isinstance(message, OrderRequest) and key == WAITING_ORDERS:
+                self._ordered(message)
+
+    def _ordered(self, message: OrderRequest) -> None:
+        """Obey an order to this actor while it waits for a run."""
+        this = self.join.actor, self.join.incarnation
+        if message.order == "drain" and (message.actor, message.incarnation) == this and self._waits:
+            host = f" at {bounded_text(message.host, MAX_NAME)}" if message.host else ""
+            self._over = RunOverError(f"drained by an operator{host} while it waited for a run")
 
     def presence_changed(self, present: bool) -> None:
         """Note that a learner of the run came or left."""
@@ -259,6 +289,7 @@ class Conversation:
         if confirmed.learner_epoch != welcome.learner_epoch:
             raise LearnerLostError
         self._has_joined = True
+        self.end_waiting()
         return confirmed
 
     @property
@@ -294,6 +325,8 @@ class Conversation:
                 remedy = yield from self._remedy(run, join)
                 raise NoLearnerError(f"no learner answered within {timeout:g} s: {remedy}")
             if pause >= _MAX_RETRY_SECONDS and self.now >= log_at and not asks_only:
+                if not awaited:
+                    self._show_waiting()
                 log_at = self.now + _LOOK_AROUND_SECONDS
                 self.check_over()  # the request may have taken 5 s, and the next one may too
                 there = [] if awaited or run == keys.ANY_RUN else (yield from self._runs(join))
@@ -306,6 +339,22 @@ class Conversation:
             if self.now > reopen_at and not asks_only:
                 yield Reopen()
                 reopen_at = self.now + _REOPEN_SECONDS
+
+    def _show_waiting(self) -> None:
+        """Let operators see that this actor waits for a run, and drain it."""
+        if self.is_actor and not self._waits:
+            self._waits = True
+            self.act(Subscribe(WAITING_ORDERS), DeclarePresence(self._waiting_key))
+
+    def end_waiting(self) -> None:
+        """Show no longer that this actor waits for a run: it takes part in one."""
+        if self._waits:
+            self._waits = False
+            self.act(WithdrawPresence(self._waiting_key), Unsubscribe(WAITING_ORDERS))
+
+    @property
+    def _waiting_key(self) -> str:
+        return keys.presence(keys.NO_RUN, self.join.actor, self.join.incarnation)
 
     def pause(self, seconds: float) -> Steps[None]:
         """Let time pass. Raises as `check_over` does."""
@@ -452,4 +501,10 @@ def _raise_if_over(answers: list[Message]) -> None:
         if isinstance(answer, Refusal) and answer.code == "finished":
             raise RunOverError("the run is over", finished=True)
         if isinstance(answer, Refusal) and answer.code == "drained":
-            raise RunOverError(DRAINED)
+            raise drained(answer.reason)
+
+
+def drained(reason: str) -> RunOverError:
+    """Return why this actor leaves, as the learner says: who ordered it."""
+    order = bounded_text(reason, MAX_ANSWER_TEXT) or "drained by an operator"
+    return RunOverError(f"{order}: this actor leaves the run")

@@ -24,9 +24,10 @@ from daedalus.protocol.texts import one_line, policy_lag, printable, short_durat
 from daedalus.transport.connecting import connect_once
 from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.status_query import ask_events, no_answer, survey
+from daedalus.transport.status_query import ask_events, no_answer, survey, waiting_actors
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
+_MOST_WAITING = 20  # names of actors that wait for a run
 _FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0  # between two looks
 _WIDTH = 100  # characters of a line of the state
 _WRAPPER = TextWrapper(_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
@@ -106,6 +107,7 @@ def status(arguments: list[str]) -> int:
             statuses = found.statuses
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
             unanswered = "" if statuses or found.unread else no_answer(transport, parsed.run)
+            waiting = list(waiting_actors(transport))
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
@@ -115,13 +117,15 @@ def status(arguments: list[str]) -> int:
         print_error("status", line)
     if not statuses:
         if unanswered:
-            print_error("status", unanswered)
+            print_error("status", f"{unanswered}{_waiting(waiting)}")
         return NO_ANSWER
     if parsed.quiet:
         _show_problems(statuses)
     else:
         for shown in filter(None, pages) if parsed.events else statuses:
-            say(_json(shown) if parsed.json else _text(shown))
+            say(_json(shown, waiting) if parsed.json else _text(shown))
+        if waiting and not (parsed.json or parsed.events):
+            say(_waiting(waiting).removeprefix("; "))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
 
 
@@ -203,9 +207,19 @@ def _show_problems(statuses: list[RunStatus]) -> None:
             say(one_line(f"{status.run}: {problem}"))
 
 
-def _json(shown: RunStatus | EventsPage) -> str:
-    """Return JSON in ASCII: texts of peers cannot command a terminal."""
-    return json.dumps(shown.model_dump(mode="json"))
+def _json(shown: RunStatus | EventsPage, waiting: Sequence[str] = ()) -> str:
+    """Return JSON in ASCII: texts of peers cannot command a terminal. `waiting` are actors that wait for a run."""
+    more = {"waiting_actors": list(waiting)} if isinstance(shown, RunStatus) else {}
+    return json.dumps({**shown.model_dump(mode="json"), **more})
+
+
+def _waiting(names: Sequence[str]) -> str:
+    """Return which actors wait for a run, as the end of a sentence."""
+    if not names:
+        return ""
+    more = f" and {len(names) - _MOST_WAITING:,} more" if len(names) > _MOST_WAITING else ""
+    actors = "1 actor waits" if len(names) == 1 else f"{len(names):,} actors wait"
+    return f"; {actors} for a run: {', '.join(names[:_MOST_WAITING])}{more}"
 
 
 def _text(shown: RunStatus | EventsPage) -> str:
@@ -246,6 +260,7 @@ def _table(status: RunStatus) -> list[str]:
         f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
+        *([f"  last order at {status.last_order}"] if status.last_order else []),
         *_actor_table(status),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
@@ -259,7 +274,7 @@ _Cell = Callable[[ActorStatus, RunStatus], str]
 # Columns of the table of actors, each with its cell. A column in which no actor has anything is left out: "-" or "".
 _COLUMNS: dict[str, _Cell] = {
     "actor": lambda actor, _: printable(actor.actor),
-    "state": lambda actor, _: "quarantined" if actor.quarantined else "alive" if actor.alive else "gone",
+    "state": lambda actor, _: _state(actor),
     "seen": lambda actor, _: f"{actor.seconds_since_seen:.1f} s",
     "lives": lambda actor, _: f"{actor.lives}" if actor.lives > 1 else "-",
     "envs": lambda actor, _: f"{actor.environments}",
@@ -278,6 +293,12 @@ _COLUMNS: dict[str, _Cell] = {
 }
 _LEFT = ("actor", "state")  # columns of words
 _LEAST_IMPORTANT = ("down", "MB/h up", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy", "waits")
+
+
+def _state(actor: ActorStatus) -> str:
+    if actor.quarantined:
+        return "quarantined"
+    return "gone" if not actor.alive else "leaving" if actor.drained_by else "alive"
 
 
 def _actor_table(status: RunStatus) -> list[str]:
@@ -310,7 +331,8 @@ def _busy_share(actor: ActorStatus) -> float:
 
 def _actor_texts(actor: ActorStatus) -> list[str]:
     rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
-    return [*([f"rejected: {rejected}"] if rejected else []), *_client_texts(actor)]
+    drained = [f"leaves: drained by {actor.drained_by}"] if actor.drained_by and actor.alive else []
+    return [*drained, *([f"rejected: {rejected}"] if rejected else []), *_client_texts(actor)]
 
 
 def _places(actors: Sequence[ActorStatus]) -> list[str]:

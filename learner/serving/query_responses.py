@@ -107,6 +107,7 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         waiting_seconds=report.waiting_seconds,
         round_trip_seconds=report.round_trip_seconds,
         silence_limit_seconds=actor.silence_limit,
+        drained_by=actor.drained_by,
     )
 
 

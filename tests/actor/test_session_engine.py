@@ -21,7 +21,7 @@ from daedalus.actor.session.conversation import (
 from daedalus.actor.session.session_engine import Collect, Load
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Acknowledgement, Join, RunEnded, SnapshotRequest, new_epoch
+from daedalus.protocol.messages import Acknowledgement, ClientReport, Join, RunEnded, SnapshotRequest, new_epoch
 
 
 def rollouts(played: PlayedSession) -> list[Query]:
@@ -144,7 +144,7 @@ def test_actor_that_is_drained_while_it_sends_nothing_ends() -> None:
     played.verdict = None
     played.go(lambda: len(rollouts(played)) == 2)
     played.learners["r"] = refusal("drained")
-    with pytest.raises(RunOverError, match="an operator drained this actor"):
+    with pytest.raises(RunOverError, match=r"^why: this actor leaves the run$"):
         played.go(lambda: False)
 
 
@@ -227,3 +227,23 @@ def test_synchronous_actor_plays_each_version_once() -> None:
     played.version = 1
     played.go(lambda: len(rollouts(played)) == 2)  # its push was lost: it is requested after a second
     assert played.now == pytest.approx(began + 1.0, abs=0.1)
+
+
+def test_actor_reports_every_five_seconds_while_it_plays_or_waits() -> None:
+    played = PlayedSession()
+    played.go(lambda: bool(played.of(Collect)))
+    rows, length = 300, SPEC.collection.rollout_length
+    for _ in range(rows):  # 30 s of a slow environment
+        played.now += 0.1
+        due = played.session.begin_row(played.now)
+        played.event(played.session.act_in_rollout if due else played.session.check_over)
+    in_rollout = played.requests(ClientReport)
+    assert len(in_rollout) in (5, 6)
+    assert [report.rows for report in in_rollout] == sorted({report.rows for report in in_rollout})
+    assert in_rollout[-1].rollout_seconds == pytest.approx(0.1 * length, rel=0.01)
+    played.verdict = None  # the learner acknowledges nothing
+    began = len(in_rollout)
+    played.go(lambda: len(played.requests(ClientReport)) >= began + 4)
+    waiting = played.requests(ClientReport)[-2:]
+    assert waiting[1].rows == waiting[0].rows
+    assert waiting[1].waiting_seconds == pytest.approx(waiting[0].waiting_seconds + 5.0, abs=0.5)

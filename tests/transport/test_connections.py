@@ -51,7 +51,7 @@ def test_messages_above_the_limit_are_dropped_and_the_session_goes_on() -> None:
     assert sizes == [MIB // 2, 0]
 
 
-@pytest.mark.parametrize("key", [keys.join("r", "arm"), keys.reports("r", "arm"), keys.orders("r")])
+@pytest.mark.parametrize("key", [keys.join("r", "arm"), keys.reports("r", "arm"), keys.orders("r", "alice")])
 def test_small_queries_are_filtered_by_their_size(key: str) -> None:
     """A router does not forward 400 MB to a learner in a request to join."""
     endpoint, router = listen_somewhere()
