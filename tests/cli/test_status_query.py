@@ -354,7 +354,7 @@ def test_another_release_hides_no_run_and_is_named(
     assert 'daedalus_healthy{run="mine"} 1.0' in lines
     assert ('daedalus_unreadable{run="other"} 1.0' in lines) == ("left out" in said or "find out" in said)
     assert said in caplog.text
-    monkeypatch.setattr("daedalus.cli.commands.status.connect_until_interrupted", lambda *_: operator)
+    monkeypatch.setattr("daedalus.cli.commands.status.connect_once", lambda *_: operator)
     assert status_command(["--connect", "tcp/127.0.0.1:1"]) == 0
     shown = capsys.readouterr()
     assert "run mine: CartPole-v1" in shown.out
