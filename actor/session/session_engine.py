@@ -11,7 +11,7 @@ from typing import Never
 
 from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.actor_config import ActorConfig
-from daedalus.actor.session.conversation import Conversation, Steps, Wait, WatchPresence
+from daedalus.actor.session.conversation import LEAVES, Conversation, RunOverError, Steps, Wait, WatchPresence
 from daedalus.actor.session.snapshots import FetchSchedule, SnapshotFeed
 from daedalus.actor.session.uploading import Reports, Uploads
 from daedalus.protocol import keys
@@ -29,6 +29,7 @@ _SLOW_SECONDS, _SLOW_ROLLOUTS = 0.25, 3  # the first rollout of an environment m
 _SLOW_LINK_WINDOW = 4  # most rollouts in flight on a slow link, unless the run asks for more
 _CONFIRMATIONS = 4  # requests for a newer snapshot within the largest age of the policy
 _REFRESH_SECONDS = 0.2  # while a client fills a rollout, and between requests for a confirmation
+_UPLOAD_SECONDS = 5.0  # of the time to leave, for the last rollout to reach the learner
 _MANY_REJECTIONS = 20  # warn after this many consecutive rejections
 
 
@@ -163,6 +164,7 @@ class ActorSession(PolicySession):
     Attributes:
       rollout_ready: set this when a client has filled a rollout.
       sequence: number of the next rollout in this learner epoch.
+      rows: rows of the present rollout that have begun. Whoever performs `Collect` counts them.
     """
 
     def __init__(
@@ -172,7 +174,8 @@ class ActorSession(PolicySession):
         super().__init__(config, origin)
         self.uploads = Uploads(config.name, self.heard)
         self.rollout_ready = False
-        self.sequence = 0
+        self.sequence = self.rows = 0
+        self._plays = self._is_collecting = False
         self._schedule = FetchSchedule()
         self._reports = None if report is None else Reports(report)
         self._played_epoch = -1  # of the learner that has the rollouts in flight
@@ -193,6 +196,7 @@ class ActorSession(PolicySession):
                 yield from self._play_with(welcome)
             except LearnerLostError as error:
                 _logger.info("%s", error)
+                self._plays = self._is_collecting = False
 
     # ------------------------------------------------------------------------------- what ends a session, and waits
 
@@ -203,6 +207,19 @@ class ActorSession(PolicySession):
         """
         super().check_over()
         self.uploads.check_over()
+
+    def check_leave(self, by: float) -> None:
+        """See Conversation. The present rollout is finished and its verdict awaited, if there is time for both."""
+        unjudged, lost = len(self.uploads.in_flight.rollouts), list[str]()
+        if self._is_collecting:
+            if self.now < by - _UPLOAD_SECONDS:
+                return
+            lost.append(f"the rollout under way is lost ({max(self.rows - 1, 0):,} rows in each environment)")
+        elif self._plays and unjudged and self.now < by:
+            return
+        if unjudged:
+            lost.append(f"{unjudged:,} uploaded rollouts had no verdict yet, and may be lost")
+        raise RunOverError(f"{LEAVES}: {'; '.join(lost) or 'no rollout is lost'}")
 
     def check(self) -> None:
         """Raise if there is a reason to stop collecting: see Conversation, and Uploads."""
@@ -227,7 +244,13 @@ class ActorSession(PolicySession):
     def due_times(self) -> list[float | None]:
         """See PolicySession."""
         report_at = None if self._reports is None else self._reports.next_at
-        return [*super().due_times(), self.uploads.in_flight.next_due(), report_at, self._confirmation_due()]
+        return [
+            *super().due_times(),
+            self.leave_by,
+            self.uploads.in_flight.next_due(),
+            report_at,
+            self._confirmation_due(),
+        ]
 
     def _confirmation_due(self) -> float | None:
         """Return when to ask whether the policy is the newest; None if its age does not matter."""
@@ -267,6 +290,7 @@ class ActorSession(PolicySession):
         """Collect and upload until something raises: the session's end, or an error."""
         synchronous, window = spec.algorithm.synchronous, spec.collection.window
         yield from self._await_newer(-1)
+        self._plays = True
         if not synchronous:
             self.feed.use_fetches()
         while True:
@@ -274,11 +298,16 @@ class ActorSession(PolicySession):
             # Before collecting, so that the rollout is of the newest policy.
             yield from self.wait(lambda: self.uploads.in_flight.has_room)
             self._warn_of_rejections()
+            if self.leave_by is not None:
+                yield from self.wait(lambda: False)  # until `check_leave` raises
             if not synchronous:
                 yield from self._await_fetch(self.now - began_waiting)
             yield self._load()
             began = self.now
-            payload = yield Encode((yield from self._collect()))
+            self.rows, self._is_collecting = 0, True
+            rollout = yield from self._collect()
+            self._is_collecting = False
+            payload = yield Encode(rollout)
             if self.config.link == "auto" and self._slow_rollouts >= _SLOW_ROLLOUTS:
                 self.feed.use_differences()  # they cost the learner little
             if self.feed.is_slow:
