@@ -204,6 +204,7 @@ def _serve_run(
     on_join: Callable[[Welcome], None],
 ) -> bool:
     """Take part in one run; return whether the run finished. Raises what `main` reports."""
+    config = replace(config, searched_since=time.monotonic())
     transport = connect_with_retry(options.connect, stop, config.timeout, credentials)
     if transport is None:
         return False

@@ -34,7 +34,7 @@ from daedalus.transport.zenoh_declarations import (
     ZenohPresence,
     ZenohRequest,
 )
-from daedalus.transport.zenoh_session import OpenSession, error_text, session_opener
+from daedalus.transport.zenoh_session import OpenSession, error_text, resolved, session_opener
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _DESCRIPTORS = Path("/dev/fd")  # of this process
@@ -98,7 +98,7 @@ def listen(
     credentials: Credentials | None = None,
     *,
     max_message_bytes: int = MAX_MESSAGE_BYTES,
-) -> Transport:
+) -> "ZenohTransport":
     """Open a router that listens on `endpoints` and connects to the routers at `connect`.
 
     Endpoints are `tcp/HOST:PORT` or `tls/HOST:PORT`. With `credentials` the router admits the names that their folder
@@ -174,6 +174,14 @@ class ZenohTransport:
             for link in self._session.info.links():
                 return link.src.partition("/")[0] if link.src.startswith("unixsock") else link.src
         return ""
+
+    def unreached(self, endpoints: list[str]) -> list[str]:
+        """Return those of the endpoints to whose hosts there is no connection, whichever end has opened it."""
+        try:
+            reached = {link.dst.rpartition(":")[0] for link in self._session.info.links()}
+        except zenoh.ZError:  # the session was closed, or is being renewed
+            return []
+        return [each for each in endpoints if not reached & {one.rpartition(":")[0] for one in resolved(each)}]
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""

@@ -41,6 +41,7 @@ from daedalus.protocol.texts import MAX_ANSWER_TEXT, MAX_NAME, bounded_text
 _logger = logging.getLogger(__name__)
 
 _ANSWER_SECONDS = 5.0  # for a query that is answered at once
+_LATE_SECONDS = 0.5  # for a query after the time to look for a learner
 _REPORT_SECONDS, _MAX_FAILURE = 2.0, 300  # for the report of a failure, and its length in characters
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
@@ -310,7 +311,8 @@ class Conversation:
 
     def _join_learner(self, run: str, join: Join, *, asks_only: bool = False) -> Steps[Welcome]:
         timeout, began = self._timeout, self.now
-        deadline = None if timeout is None else began + timeout
+        since = began if self.run or self.config.searched_since is None else self.config.searched_since
+        deadline = None if timeout is None else since + timeout
         pause, logged, log_at, reopen_at = _FIRST_RETRY_SECONDS, "", 0.0, began + _REOPEN_SECONDS
         name_free_by = began + (_NAME_IN_USE_SECONDS if timeout is None else min(_NAME_IN_USE_SECONDS, timeout))
         alone_by: float | None = None
@@ -318,7 +320,7 @@ class Conversation:
             self.check_over()  # a request may take 5 s
             awaited, welcomes = "", list[Welcome]()
             try:
-                welcomes = yield from self._request_joins(run, join)
+                welcomes = yield from self._request_joins(run, join, deadline)
             except NameInUseError:
                 if self.now > name_free_by:
                     raise
@@ -339,7 +341,8 @@ class Conversation:
                     self._show_waiting()
                 log_at = self.now + _LOOK_AROUND_SECONDS
                 self.check_over()  # the request may have taken 5 s, and the next one may too
-                text = f"waiting for {awaited or (yield from self._awaited(run, join))}"
+                there = [] if awaited or run == keys.ANY_RUN else (yield from self._runs(join))
+                text = f"waiting for {awaited or _awaited(run, there)}"
                 if text != logged:
                     _logger.info("%s", text)
                 logged = text
@@ -374,32 +377,28 @@ class Conversation:
 
     def _remedy(self, run: str, join: Join) -> Steps[str]:
         """Return what to do where no learner of the run answers."""
-        if run != keys.ANY_RUN and (yield from self._runs(join)):
-            return f"waited for {yield from self._awaited(run, join)}; choose with --run"
+        if run != keys.ANY_RUN and (there := (yield from self._runs(join, _LATE_SECONDS))):
+            return f"waited for {_awaited(run, there)}; choose with --run"
         return "check that the learner runs and that the address is correct"
 
-    def _awaited(self, run: str, join: Join) -> Steps[str]:
-        """Return which learner the actor waits for, and which runs are there instead."""
-        if run == keys.ANY_RUN:
-            return "a learner"
-        there = ", ".join(repr(name) for name in (yield from self._runs(join)) if name != run)
-        return f"a learner of run {run!r}" + (f"; the runs here are {there}" if there else "")
-
-    def _runs(self, join: Join) -> Steps[list[str]]:
-        """Return the names of the runs whose learners answer."""
+    def _runs(self, join: Join, within: float = _ANSWER_SECONDS) -> Steps[list[str]]:
+        """Return the names of the runs whose learners answer in time."""
         request, runs = encode(replace(join, spaces=None, environments=0)), set[str]()
-        for answer in (yield Ask(keys.join(keys.ANY_RUN, join.actor), request)):
+        for answer in (yield Ask(keys.join(keys.ANY_RUN, join.actor), request, within)):
             with contextlib.suppress(ProtocolError):  # a learner of another version is not the one awaited
                 message = decode(answer, LEARNER_LIMITS)
                 runs.update({message.run} if isinstance(message, Welcome) else ())
         return sorted(runs)[:_MAX_RUNS]
 
-    def _request_joins(self, run: str, join: Join) -> Steps[list[Welcome]]:
+    def _request_joins(self, run: str, join: Join, deadline: float | None) -> Steps[list[Welcome]]:
         """Send a request to join; return the answers of the learners of one run, the newest first.
+
+        The answers are awaited until a little after the deadline at most.
 
         Raises ActorError or RunOverError if refused, and ActorError if learners of several runs answer.
         """
-        answers = yield from self.ask(keys.join(run, join.actor), encode(join))
+        within = _ANSWER_SECONDS if deadline is None else max(min(deadline - self.now, _ANSWER_SECONDS), _LATE_SECONDS)
+        answers = yield from self.ask(keys.join(run, join.actor), encode(join), within)
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
         names = sorted({welcome.run for welcome in welcomes})
         if len(names) > 1:
@@ -450,9 +449,9 @@ class Conversation:
                     return model
         return None
 
-    def ask(self, key: str, payload: bytes = b"") -> Steps[list[Message]]:
+    def ask(self, key: str, payload: bytes = b"", within: float = _ANSWER_SECONDS) -> Steps[list[Message]]:
         """Send a query and return the decoded answers. Raises ActorError if all are of another release."""
-        answers = yield Ask(key, payload)
+        answers = yield Ask(key, payload, within)
         return (yield Work(partial(self._decode_all, answers)))
 
     def _decode_all(self, answers: list[bytes]) -> list[Message]:
@@ -488,6 +487,14 @@ class Conversation:
                 ) from None
             _logger.warning("ignored a damaged message: %s", error)
             return None
+
+
+def _awaited(run: str, there: list[str]) -> str:
+    """Return which learner an actor waits for, and which runs are there instead."""
+    if run == keys.ANY_RUN:
+        return "a learner"
+    others = ", ".join(repr(name) for name in there if name != run)
+    return f"a learner of run {run!r}" + (f"; the runs here are {others}" if others else "")
 
 
 def _log_several(welcomes: list[Welcome]) -> None:

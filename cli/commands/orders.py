@@ -10,7 +10,7 @@ from daedalus.launch.process_lifecycle import status_at_start
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import RunStatus
-from daedalus.transport.connecting import connect_until_interrupted
+from daedalus.transport.connecting import connect_once
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.operator_orders import Operator, OrderError
@@ -142,7 +142,7 @@ def _give(
         print_error(command, error)
         return status_at_start(error)
     try:
-        transport = connect_until_interrupted(parsed.connect, credentials)
+        transport = connect_once(parsed.connect, credentials, getattr(parsed, "timeout", None))
         try:
             order(transport, Operator.here(credentials))
         except KeyboardInterrupt:

@@ -21,8 +21,9 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import one_line, policy_lag, printable, short_number
-from daedalus.transport.connecting import connect_until_interrupted
-from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
+from daedalus.transport.certificate_expiry import WARNING_DAYS
+from daedalus.transport.connecting import connect_once
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.status_query import ask, ask_events, no_answer, waiting_actors
 
@@ -100,7 +101,7 @@ def status(arguments: list[str]) -> int:
     try:
         if parsed.watch:
             return _watch(parsed, credentials)
-        transport = connect_until_interrupted(parsed.connect, credentials)
+        transport = connect_once(parsed.connect, credentials)
         try:
             statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
@@ -128,7 +129,7 @@ def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
     screen = Screen()
     frames = screen.shows_frames and not parsed.json
     shown = _json if parsed.json else _text
-    connect = partial(connect_until_interrupted, parsed.connect, credentials)
+    connect = partial(connect_once, parsed.connect, credentials)
     watch_status(connect, parsed.run, screen, shown, frames=frames)
     return HEALTHY
 
@@ -148,19 +149,32 @@ def watch_status(
     Raises TransportError if the learner refuses this process, or if its answers are damaged.
     """
     wanted = "no learner" if run == keys.ANY_RUN else f"no learner of run {run!r}"
-    nobody, waiting = f"{wanted} answers at this address; waiting for one (Ctrl-C ends)", False
+    nobody = f"{wanted} answers at this address"
+    reason, said = nobody, ""  # why no run is shown, and what the user has read of it
+
+    def open_transport() -> Transport:
+        nonlocal reason
+        try:
+            transport = connect()
+        except TransportError as error:
+            reason = str(error)
+            raise
+        reason = nobody
+        return transport
+
     with suppress(KeyboardInterrupt):
         try:
-            for runs in looks(connect, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+            for runs in looks(open_transport, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+                waiting = "" if runs else f"{reason}; waiting for one (Ctrl-C ends)"
                 if frames and runs:
                     screen.show(runs)
                 elif frames:
-                    screen.say(nobody)
-                elif not runs and not waiting:
-                    screen.err(f"daedalus status: {nobody}")
+                    screen.say(waiting)
+                elif waiting and waiting != said:
+                    screen.err(f"daedalus status: {waiting}")
                 for each in runs if not frames else ():
                     screen.out(text(each.status))
-                waiting = not runs
+                said = waiting
         finally:
             screen.end()
 
@@ -348,7 +362,8 @@ def _refused(refused: RefusedJoin) -> str:
 def _expiry(days: float | None) -> list[str]:
     if days is None or days > WARNING_DAYS:
         return []
-    return [f"  the learner's certificate expires in {days:.0f} days: renew it (daedalus certs renew)"]
+    when = f"expires in {days:.0f} days" if days > 0 else f"expired {-days:.0f} days ago"
+    return [f"  the learner's certificate {when}: renew it (daedalus certs renew learner)"]
 
 
 def _missing_actors(status: RunStatus) -> list[str]:
