@@ -25,7 +25,8 @@ from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.policy.user_modules import allow_settings
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.texts import without_secrets
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
@@ -77,8 +78,7 @@ class RecordedRun:
         if ended and (steps is None or done <= steps):
             return ""
         running = is_locked(self.directory)
-        command = f"daedalus resume {shlex.quote(str(self.directory))}"
-        remedy = "it is still running" if running else f"continue it with: {command}"
+        remedy = "it is still running" if running else f"continue it with: {self.command('resume')}"
         return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
 
     @property
@@ -108,6 +108,34 @@ class RecordedRun:
             return EnvironmentSpec.model_validate(values)
         except ValidationError:
             return None
+
+    def command(self, name: str, *words: str, path: str = "") -> str:
+        """Return the line that gives this run to a command, with the modules that the command has to be allowed.
+
+        Args:
+          name: "train", "resume" or "evaluate".
+          words: further words.
+          path: of a file in the directory, in place of the directory.
+        """
+        allowed = self._modules if name != "evaluate" else self.environment.user_modules if self.environment else {}
+        return shlex.join(["daedalus", name, str(self.directory / path), *words, *allow_settings(allowed)])
+
+    @property
+    def record_command(self) -> str:
+        """Command that evaluates the run and records the result in its directory."""
+        return self.command("evaluate", "--record")
+
+    @property
+    def _modules(self) -> dict[str, str]:
+        """Settings that name a module; none if this release does not know the settings."""
+        sections: dict[str, dict[str, Any]] = {}
+        for path, value in self.settings.items():
+            section, _, key = path.partition(".")
+            sections.setdefault(section, {})[key] = value
+        try:
+            return RunSpec.model_validate(sections).user_modules
+        except ValidationError:
+            return {}
 
     @property
     def trains_true_task(self) -> bool:
@@ -228,11 +256,6 @@ def _summary(path: Path) -> dict[str, Any]:
         if not _is_number(content.get(name)):
             raise RunDataError(f"{path} is damaged: {name} is not a number")
     return content
-
-
-def record_command(directory: Path) -> str:
-    """Return the command that evaluates a run and records the result in its directory."""
-    return f"daedalus evaluate {shlex.quote(str(directory))} --record"
 
 
 def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
@@ -383,7 +406,7 @@ def _evaluation(run: RecordedRun) -> RecordedEvaluation | None:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise RunDataError(
-            f"{path} is damaged ({where}: {first['msg']}): write it again with: {record_command(run.directory)}"
+            f"{path} is damaged ({where}: {first['msg']}): write it again with: {run.record_command}"
         ) from None
 
 

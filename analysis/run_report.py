@@ -6,32 +6,31 @@ comes from outside cannot become markup.
 
 import base64
 import math
-import shlex
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from daedalus.analysis.charts import SERIES_COLOURS, histogram, line_chart
 from daedalus.analysis.comparison import Comparison, cells, compare_groups, header, notes
-from daedalus.analysis.learning_curves import LARGEST, series_of
-from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite, record_command
-from daedalus.analysis.run_groups import Group, text
+from daedalus.analysis.learning_curves import LARGEST, Series, series_of
+from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite
+from daedalus.analysis.report_charts import LARGE, SERIES_COLOURS, SMALL, histogram, line_chart
+from daedalus.analysis.run_groups import Group
 from daedalus.analysis.run_results import (
     EpisodeStatistics,
     episode_statistics,
     failed_events,
     failure_counts,
     interval_text,
-    setting_text,
     statistics_rows,
     together,
     written,
 )
 from daedalus.learner.reporting.metrics_rows import ENV, USER
 from daedalus.learner.run.run_directory import CONFIG
+from daedalus.learner.run.settings import changed_settings, setting_text, value_text
 from daedalus.protocol.texts import printable
 
 _STYLE = Path(__file__).with_name("report_style.css")
@@ -63,7 +62,7 @@ Child = str | int | float | None | ET.Element | Iterable["Child"]
 
 
 def run_page(group: Group[RunRecord], by: str) -> str:
-    """Return the report of one run. Raises ModuleNotFoundError without matplotlib, as `comparison_page` does.
+    """Return the report of one run.
 
     Args:
       group: the run alone, with the name that the curves have.
@@ -83,9 +82,10 @@ def run_page(group: Group[RunRecord], by: str) -> str:
         _header(record.name, facts, record.status),
         element("p", unfinished, class_="note") if unfinished else None,
         summary_tiles(record),
-        _curves([group], by),
-        evaluation_section(record),
+        return_section([group], by),
         video_section(record),
+        evaluation_section(record),
+        _curves([group], by),
         failure_section(record),
         settings_section(record),
         versions_section(record),
@@ -117,6 +117,7 @@ def comparison_page(
         title,
         _header(title, [f"{len(groups)} groups" if len(groups) > 1 else "1 group"], None),
         [element("p", line, class_="note") for line in [*left_out, *unfinished]],
+        return_section(groups, by),
         comparison_section(comparison),
         _curves(groups, by),
         runs_section(groups),
@@ -181,7 +182,7 @@ def evaluation_section(record: RunRecord) -> ET.Element:
     if evaluation is None:
         how = [
             "No evaluation is recorded. Evaluate the run with: ",
-            element("code", record_command(record.directory)),
+            element("code", record.record_command),
         ]
         return section("Evaluation", element("p", how, class_="note"))
     statistics = episode_statistics(evaluation)
@@ -204,7 +205,7 @@ def _returns(record: RunRecord, statistics: EpisodeStatistics) -> ET.Element:
     assert record.evaluation is not None
     if statistics.interquartile is None:
         how = "The returns of the episodes are not recorded, so there is no histogram. Evaluate the run again with: "
-        return element("p", how, element("code", record_command(record.directory)), class_="note")
+        return element("p", how, element("code", record.record_command), class_="note")
     returns = np.array(record.evaluation.returns)
     if not (np.abs(returns) < LARGEST).all():
         return element("p", "The returns are too large for a histogram.", class_="note")
@@ -280,32 +281,54 @@ def failure_section(record: RunRecord) -> ET.Element:
 
 
 def settings_section(record: RunRecord) -> ET.Element:
-    """Return all settings of the run, by their sections."""
+    """Return the settings of the run: those that differ from the defaults, and all others below a heading to open."""
+    changed = set(changed_settings(record.settings))
+    known = {path: value for path, value in record.settings.items() if value is not None}
+    others = {path: value for path, value in known.items() if path not in changed}
+    return section(
+        "Settings that differ from the defaults",
+        _settings_columns("settings", {path: value for path, value in known.items() if path in changed}),
+        element(
+            "details",
+            element("summary", f"{len(others)} settings at their defaults"),
+            _settings_columns("defaults", others),
+        ),
+    )
+
+
+def _settings_columns(label: str, settings: Mapping[str, object]) -> ET.Element:
+    """Return a table of settings for each section. `label` says what they are, for screen readers."""
     parts: dict[str, list[tuple[str, str]]] = {}
-    for path, value in record.settings.items():
+    for path, value in settings.items():
         part, _, name = path.partition(".")
-        if value is not None:
-            parts.setdefault(part, []).append((name, setting_text(value)))
+        parts.setdefault(part, []).append((name, setting_text(value)))
     columns = [
-        element("div", element("h3", part), table((), rows, label=f"settings: {part}"), class_="card")
+        element("div", element("h3", part), table((), rows, label=f"{label}: {part}"), class_="card")
         for part, rows in parts.items()
-        if rows
     ]
-    return section("Settings", element("div", columns, class_="columns"))
+    return element("div", columns, class_="columns")
 
 
 def versions_section(record: RunRecord) -> ET.Element | None:
     """Return the versions of the packages that the run was started with, or None if they are not recorded."""
     if not record.versions:
         return None
-    return section("Versions", table((), record.versions.items(), label="versions"))
+    versions = table((), record.versions.items(), label="versions")
+    return section("Versions", element("details", element("summary", f"{len(record.versions)} versions"), versions))
 
 
 def repeat_section(record: RunRecord) -> ET.Element:
     """Return the commands that train and evaluate the same again."""
-    config, directory = (shlex.quote(str(path)) for path in (record.directory / CONFIG, record.directory))
-    commands = f"daedalus train {config}\ndaedalus evaluate {directory}"
-    return section("Do it again", element("pre", commands, tabindex=0))
+    origin = record.versions.get("init_from")
+    others = ["--allow-other-spaces"] if record.versions.get("init_from_other_spaces") else []
+    begun = ["--init-from", origin, *others] if origin else []
+    commands = [record.command("train", *begun, path=CONFIG), record.command("evaluate")]
+    trust = "The run has code of its author: allow its modules only if you trust that code."
+    return section(
+        "Do it again",
+        element("pre", "\n".join(commands), tabindex=0),
+        element("p", trust, class_="note") if "--allow-module" in commands[0] else None,
+    )
 
 
 def comparison_of(groups: Sequence[Group], threshold: float | None) -> Comparison | None:
@@ -342,7 +365,7 @@ def runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element:
                 (
                     record.name,
                     group.name,
-                    text(record.settings.get("training.seed")),
+                    value_text(record.settings.get("training.seed")),
                     record.status,
                     written(record.number("env_steps")),
                     written(None if seconds is None else seconds / 60.0),
@@ -392,28 +415,47 @@ def versions_of_runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element |
     return section("Versions", table(head, rows, label="versions"))
 
 
-def _curves(groups: Sequence[Group], by: str) -> ET.Element:
-    """Return a chart of each column of the metrics that has values."""
+def return_section(groups: Sequence[Group], by: str) -> ET.Element:
+    """Return the chart of the return, large, with its explanation."""
     several = len(groups) > 1 or len(groups[0].runs) > 1
     band = "The band is one standard deviation of the newest episodes, circles are evaluations."
     if several:
         band = "A line of several runs is their interquartile mean, its band the 95 % bootstrap interval."
         if any(len(group.runs) == 1 for group in groups):
             band += " A line of one run has one standard deviation of the newest episodes, and circles for evaluations."
+    lines, colours = _lines(groups, RETURN, by)
+    # Two sizes, so that texts have the same size on a wide and on a narrow page: each shows one of them.
+    sizes = (("on-wide", LARGE), ("on-narrow", SMALL))
+    drawn = [
+        element("div", line_chart(_TITLES[RETURN], lines, unit=by, colours=colours, size=size), class_=name)
+        for name, size in sizes
+        if lines
+    ]
+    nothing = None if lines else element("p", "No episode has ended: there is no return.", class_="note")
+    return section(
+        "Return",
+        _legend([_key_of(group, index) for index, group in enumerate(groups)]) if several else None,
+        nothing or element("figure", element("figcaption", _TITLES[RETURN]), drawn, class_="chart"),
+        element("p", band, class_="muted"),
+    )
+
+
+def _curves(groups: Sequence[Group], by: str) -> ET.Element | None:
+    """Return a chart of each other column of the metrics that has values, or None if there is none."""
     columns = {name for group in groups for run in group.runs for name in run.metrics}
     own = sorted(name for name in columns if name.startswith((ENV, USER)))[:_MOST_OWN]
     charts = []
     for column, title in {**_TITLES, **{name: name for name in own}}.items():
-        found = [(series, index) for index, group in enumerate(groups) if (series := series_of(group, column, by))]
-        if any(column == RETURN or series.y.any() for series, _ in found):  # all 0: nothing of the kind happened
-            lines, colours = zip(*found, strict=True)
+        lines, colours = _lines(groups, column, by)
+        if column != RETURN and any(series.y.any() for series in lines):  # all 0: nothing of the kind happened
             charts.append(_figure(title, line_chart(title, lines, unit=by, colours=colours)))
-    return section(
-        "Learning curves",
-        element("p", band, class_="muted"),
-        _legend([_key_of(group, index) for index, group in enumerate(groups)]) if several else None,
-        element("div", charts, class_="charts"),
-    )
+    return section("Learning curves", element("div", charts, class_="charts")) if charts else None
+
+
+def _lines(groups: Sequence[Group], column: str, by: str) -> tuple[list[Series], list[int]]:
+    """Return the lines of the groups that have values of a column, and their colours."""
+    found = [(series, index) for index, group in enumerate(groups) if (series := series_of(group, column, by))]
+    return [series for series, _ in found], [index for _, index in found]
 
 
 def _key_of(group: Group, index: int) -> tuple[str, int, bool]:

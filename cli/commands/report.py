@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-from daedalus.analysis.charts import INSTALL
 from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS, read_record
 from daedalus.analysis.run_groups import select
 from daedalus.analysis.run_report import comparison_page, run_page
@@ -72,9 +71,6 @@ def report(arguments: list[str]) -> int:
             output = parsed.output or Path(_NAME)
     except RunDataError as error:
         print_error("report", error)
-        return 1
-    except ModuleNotFoundError:
-        print_error("report", INSTALL)
         return 1
     try:
         replace_text(output, page)

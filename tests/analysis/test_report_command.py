@@ -102,6 +102,41 @@ def test_a_report_shows_evaluation_curves_settings_and_versions(folder: Path) ->
     assert "daedalus train run/config.toml" in text
 
 
+def test_the_return_is_first_and_settings_at_their_defaults_are_collapsed(folder: Path) -> None:
+    run = evaluated(record(folder / "run"))
+    assert report(["run"]) == 0
+    page = (run / "report.html").read_text()
+    sections = re.findall(r"<h2>([^<]*)</h2>", page)
+    assert sections[:3] == ["Return", "Evaluation", "Learning curves"]
+    assert (
+        page.index("return of the training episodes") < page.index("episodes by return") < page.index("entropy (nats)")
+    )
+    shown, _, collapsed = page[page.index("Settings that differ") :].partition("<details>")
+    assert "target_return" in shown
+    assert "stop_when_solved" not in shown  # the preset leaves it
+    assert "stop_when_solved" in collapsed
+
+
+def test_the_commands_of_a_report_work_as_they_are(folder: Path) -> None:
+    """They allow the modules that the run names, and begin with the same weights."""
+    own = ("environment.id=corridor:Corridor-v0", "policy.encoder=parts:Encoder")
+    run = record(folder / "run", settings=own, evaluation=None)
+    versions = json.loads((run / "versions.json").read_text())
+    origin = {"init_from": "/runs/first one", "init_from_other_spaces": True}
+    (run / "versions.json").write_text(json.dumps({**versions, **origin}))
+    assert report(["run"]) == 0
+    text = Page(run / "report.html").text
+    assert (
+        "daedalus train run/config.toml --init-from '/runs/first one' --allow-other-spaces "
+        "--allow-module corridor --allow-module parts\ndaedalus evaluate run --allow-module corridor The run"
+    ) in text
+    assert "only if you trust that code" in text
+    assert "daedalus evaluate run --record --allow-module corridor" in text
+    (run / "summary.json").unlink()
+    assert report(["run"]) == 0
+    assert "daedalus resume run --allow-module corridor --allow-module parts" in Page(run / "report.html").text
+
+
 def test_a_histogram_counts_the_episodes(folder: Path) -> None:
     run = evaluated(record(folder / "run"), [0.0, 0.0, 0.0, 10.0])
     assert report(["run"]) == 0

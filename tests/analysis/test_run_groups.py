@@ -7,8 +7,9 @@ from recorded_runs import record
 
 from daedalus.analysis.comparison import as_text, compare_groups
 from daedalus.analysis.recorded_run import RecordedRun, read_run
-from daedalus.analysis.run_groups import by_settings, by_user, check_comparable, text
+from daedalus.analysis.run_groups import by_settings, by_user, check_comparable
 from daedalus.learner.run.run_files import RunDataError
+from daedalus.learner.run.settings import value_text
 
 
 def run(folder: Path, name: str, *settings: str, seed: int = 1, preset: str = "cartpole") -> RecordedRun:
@@ -118,4 +119,4 @@ def test_runs_of_different_environments_are_refused(tmp_path: Path) -> None:
 
 def test_values_are_short_texts() -> None:
     values = [1, True, 0.0003, 1e-10, [64, 64], None, "tanh"]
-    assert [text(value) for value in values] == ["1", "true", "0.0003", "1e-10", "[64,64]", "unset", "tanh"]
+    assert [value_text(value) for value in values] == ["1", "true", "0.0003", "1e-10", "[64,64]", "unset", "tanh"]
