@@ -25,6 +25,7 @@ from daedalus.policy.user_code import frames_of, is_of_user
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Welcome
+from daedalus.transport.addresses import socket_path
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect
 from daedalus.transport.interface import TransportError, UnreachableError
@@ -72,7 +73,8 @@ class ActorOptions:
             environments=self.environments,
             runtime=self.runtime,
             modules=UserModules(self.allowed_modules, "the learner"),
-            link=self.link,
+            # Between processes of one machine, only a busy processor is slow.
+            link="lan" if self.link == "auto" and all(map(socket_path, self.connect)) else self.link,
             timeout=self.timeout,
             any_run=self.any_run,
         )

@@ -210,6 +210,7 @@ class RunStatus(Specification):
     actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
+    updates_per_batch: int = 1  # by which a policy lag in updates is one in batches
 
     @property
     def fleet_size(self) -> int:

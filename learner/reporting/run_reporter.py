@@ -217,6 +217,7 @@ class RunReporter:
             **totals(fleet),
             refused_joins=fleet.refused_joins.report(now),
             actors=page(fleet, "", now),
+            updates_per_batch=spec.training.updates_per_batch,
         )
 
     def summary(self, *, finished: bool, now: float) -> dict[str, Any]:
