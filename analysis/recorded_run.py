@@ -7,7 +7,6 @@ of the reader's. Imports no module of a run."""
 import csv
 import json
 import math
-import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -20,14 +19,12 @@ from pydantic import BaseModel, Field, ValidationError
 
 from daedalus.learner.reporting.metrics_rows import lasting
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, EVENTS, METRICS, OUTPUT, SUMMARY, VERSIONS
-from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
+from daedalus.learner.run.run_files import RunDataError, read_end, read_file, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
-from daedalus.policy.saving.regular_files import open_regular
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
-from daedalus.protocol.texts import without_secrets
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
@@ -381,7 +378,7 @@ def read_record(directory: Path, columns: Sequence[str] = ()) -> RunRecord:
         confirmation=confirmation if isinstance(confirmation, dict) else {},
         versions={name: str(value) for name, value in versions.items() if value is not None},
         events=events,
-        output=_end_of(directory / OUTPUT),
+        output=read_end(directory / OUTPUT, _MAX_OUTPUT_BYTES),
         video=_video(directory),
     )
 
@@ -408,17 +405,6 @@ def _evaluation(run: RecordedRun) -> RecordedEvaluation | None:
         raise RunDataError(
             f"{path} is damaged ({where}: {first['msg']}): write it again with: {run.record_command}"
         ) from None
-
-
-def _end_of(path: Path) -> str:
-    if path.is_symlink():
-        return ""
-    try:
-        with open_regular(path) as file:
-            file.seek(max(os.fstat(file.fileno()).st_size - _MAX_OUTPUT_BYTES, 0))
-            return without_secrets(file.read(_MAX_OUTPUT_BYTES).decode("utf-8", "replace").strip())
-    except OSError:
-        return ""
 
 
 def _video(directory: Path) -> Video | None:

@@ -118,7 +118,9 @@ def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
     frame = next(number for number, line in enumerate(running.terminal.lines) if line.startswith("CartPole-v1, impala"))
     assert running.terminal.lines[frame + 2].startswith("return ")
     assert "stopped; checkpoint saved at" in "".join(running.terminal.lines[:frame])  # a long line goes on below
-    assert "".join(running.terminal.lines[frame + 5 :]) == "stopped; continue with: daedalus resume shown-run"
+    left, how = "report: shown-run/report.html", "stopped; continue with: daedalus resume shown-run"
+    assert "".join(running.terminal.lines[frame + 5 :]) == left + how
+    assert (tmp_path / "shown-run" / "report.html").exists()
     assert not processes_mentioning("shown-run")
 
 

@@ -170,7 +170,9 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     page.get_by_role("dialog").get_by_role("button", name="Stop the run").click()
     assert process.wait() == 1, process.output
     assert "stopped; continue with: daedalus resume run" in process.output
-    wait_for(page, "['lost', 'closed', 'ended'].includes(document.querySelector('#state').dataset.state)")
+    page.wait_for_selector("#notices:has-text('The gateway has ended, too')")
+    assert page.locator("#state").get_attribute("data-state") == "stopped"
+    assert "Continue it with: daedalus resume run" in text_of(page, "#notices")
 
 
 # --------------------------------------------------------------------------------------- runs made for the page
