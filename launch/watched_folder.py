@@ -66,7 +66,7 @@ class WatchedFolder:
             case _:
                 evaluated = []
         report = self._directory / REPORT
-        newest = self._stamp(REPORT) >= self._stamp(SUMMARY) > (0, 0)  # else of an earlier end of the run
+        newest = self._stamp(REPORT)[0] >= self._stamp(SUMMARY)[0] > 0  # else of an earlier end of the run
         words = ["daedalus", "resume", str(self._directory), *allow_settings(self._modules)]
         left = [f"Report, on the host of the gateway: {report}"] if newest else []
         how = [] if summary.get("finished") else [f"Continue it with: {' '.join(words)}"]

@@ -10,9 +10,9 @@ export function ticks(low, high, count) {
   const rough = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].find((factor) => factor * power >= rough) * power;
-  const found = [];
-  for (let index = Math.ceil(low / step - 1e-9); index * step <= high + 1e-9 * step; index++) found.push(index * step);
-  return found;
+  const first = Math.ceil(low / step - 1e-9);
+  const more = Math.min(Math.floor(high / step + 1e-9) - first, 2 * count); // of ends that are nearly equal, too
+  return Array.from({ length: Math.max(more + 1, 0) }, (_, index) => (first + index) * step);
 }
 
 /** Return at most two points for each pixel: the lowest and the highest of those that share it. */
@@ -39,7 +39,8 @@ export function range(lists) {
     }
   }
   if (low > high) return null;
-  const pad = high > low ? 0.05 * (high - low) : Math.abs(high) * 0.1 || 1;
+  const isFlat = high - low <= 1e-9 * Math.max(Math.abs(low), Math.abs(high));
+  const pad = isFlat ? Math.abs(high) * 0.1 || 1 : 0.05 * (high - low);
   return [low - pad, high + pad];
 }
 
@@ -48,7 +49,7 @@ export function smoothed(points, rows) {
   if (rows <= 1) return points;
   return points.map(([at], index) => {
     const part = points.slice(Math.max(index + 1 - rows, 0), index + 1);
-    const mean = (place) => part.reduce((sum, point) => sum + point[place] / part.length, 0);
+    const mean = (place) => part.reduce((sum, point) => sum + point[place], 0) / part.length;
     return [at, mean(1), mean(2)];
   });
 }

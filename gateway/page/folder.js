@@ -4,9 +4,12 @@ import { byId, element, setText } from "./dom.js";
 import { counted } from "./format.js";
 
 export class Folder {
-  /** Show a message: settings [name, value, whether it differs from the default], and the output, null if refused. */
+  /** Show a message: settings [name, value, whether it differs from the default], and the output, both null if refused. */
   show({ settings, output }) {
-    byId("folder").hidden = false;
+    byId("folder").hidden = settings !== null && !settings.length && !output;
+    byId("unchanged-part").hidden = settings === null;
+    const refused = "Settings and output are shown to holders of a token: start the gateway with --operator-token FILE.";
+    if (settings === null) return setText(byId("output-note"), refused);
     const [changed, unchanged] = [true, false].map((wanted) => settings.filter(([, , differs]) => differs === wanted));
     byId("changed").replaceChildren(table("Settings that differ from their defaults", changed));
     byId("unchanged").replaceChildren(table("Settings at their defaults", unchanged));
@@ -18,9 +21,8 @@ export class Folder {
     const pane = byId("output");
     const atEnd = pane.scrollTop + pane.clientHeight >= pane.scrollHeight - 4;
     pane.hidden = !output;
-    const refused = "Shown to holders of a token only: start the gateway with --operator-token FILE.";
-    setText(byId("output-note"), output === null ? refused : output ? "The newest lines are at the end." : "Nothing was printed yet.");
-    setText(pane, output ?? "");
+    setText(byId("output-note"), output ? "The newest lines are at the end." : "Nothing was printed yet.");
+    setText(pane, output);
     if (atEnd) pane.scrollTop = pane.scrollHeight;
   }
 }

@@ -88,9 +88,10 @@ def run_message(seen: Observation) -> dict[str, Any]:
     return {"type": "run", "state": seen.state, "reason": seen.reason, "ends": ends, "status": status}
 
 
-def folder_message(folder: FolderView, *, with_output: bool) -> dict[str, Any]:
-    """Return the message about the run directory. The output is None if the viewer may not read it."""
-    return {"type": "folder", "settings": folder.settings, "output": folder.output if with_output else None}
+def folder_message(folder: FolderView, *, readable: bool) -> dict[str, Any]:
+    """Return the message about the run directory, whose parts are None if the viewer may not read it."""
+    settings, output = (folder.settings, folder.output) if readable else (None, None)
+    return {"type": "folder", "settings": settings, "output": output}
 
 
 def actors_message(actors: tuple[ActorStatus, ...]) -> dict[str, Any]:

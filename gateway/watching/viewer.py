@@ -93,7 +93,7 @@ class ViewerConnection:
         self._sent: Observation | None = None
         self._camera: asyncio.Task[None] | None = None
         self._task: asyncio.Task[Any] | None = None
-        self._reads_output = False
+        self._reads_folder = False
         self._end: ClientError | None = None  # why the gateway ends the connection
 
     async def serve(self) -> None:
@@ -105,7 +105,7 @@ class ViewerConnection:
         try:
             owner = await self._greet()
             is_operator = owner.startswith(OPERATOR)
-            self._reads_output = bool(owner)  # others are whoever reaches the gateway, and the file is its owner's
+            self._reads_folder = bool(owner)  # without a token: whoever reaches the gateway; a run directory is private
             try:
                 with self._data.places.take(owner or self._channel.peer, self.end, is_operator=is_operator):
                     self._channel.settle(True)
@@ -179,7 +179,7 @@ class ViewerConnection:
         if sent is None or seen.events is not sent.events:
             messages.append(page_data.events_message(seen.events))
         if seen.folder is not None and (sent is None or seen.folder != sent.folder):
-            messages.append(page_data.folder_message(seen.folder, with_output=self._reads_output))
+            messages.append(page_data.folder_message(seen.folder, readable=self._reads_folder))
         if sent is None or sent.generation != seen.generation:
             messages.append(page_data.metrics_message(seen, False, 0))
         elif seen.rows is not sent.rows:
