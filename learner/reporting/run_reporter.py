@@ -27,7 +27,8 @@ from daedalus.protocol.messages import RunStatus
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
 
-_DETAILS_SECONDS = 10.0  # between details: they take far more space than a row
+_DETAILS_SECONDS = 10.0  # between details: they take far more space than a row,
+_DETAILS = 100  # and in an old run their distance is this part of its age
 
 _logger = logging.getLogger(__name__)
 
@@ -173,7 +174,7 @@ class RunReporter:
         """Return the distributions and the picture that belong to a metrics row; most rows have none."""
         if now < self._details_at and not last:
             return Details()
-        self._details_at = now + _DETAILS_SECONDS
+        self._details_at = now + max(_DETAILS_SECONDS, self._context.wall_seconds(now) / _DETAILS)
         with self._context.lock:
             returns, lengths = list(self._counters.returns), list(self._counters.lengths)
         return Details(
