@@ -30,7 +30,7 @@ from daedalus.transport.status_query import ask
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Debian's chromium")
 MILLISECONDS = 1000 * LIMIT
 FOLDER = FolderView(
-    settings=(("environment.id", HOSTILE, True), ("training.discount_factor", "0.99", False)), output="x"
+    settings=(("environment.id", HOSTILE, True), ("training.discount_factor", "0.99", False)), output=HOSTILE
 )
 TOKEN = "an operator's token of some length"
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
