@@ -28,6 +28,7 @@ from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.texts import bounded_text
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
@@ -80,7 +81,9 @@ class RecordedRun:
             return ""
         running = is_locked(self.directory)
         remedy = "it is still running" if running else f"continue it with: {self.command('resume')}"
-        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
+        author = self.summary.get("stopped_by")
+        stopped = f", stopped by {bounded_text(author)}" if isinstance(author, str) and not running else ""
+        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps){stopped}: {remedy}"
 
     @property
     def evaluation_return(self) -> float | None:

@@ -17,7 +17,7 @@ from daedalus.analysis.comparison import Comparison, cells, compare_groups, head
 from daedalus.analysis.learning_curves import LARGEST, Series, series_of
 from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite
 from daedalus.analysis.report_charts import LARGE, SERIES_COLOURS, SMALL, histogram, line_chart
-from daedalus.analysis.run_groups import Group
+from daedalus.analysis.run_groups import Group, environment_of
 from daedalus.analysis.run_results import (
     EpisodeStatistics,
     episode_statistics,
@@ -31,6 +31,7 @@ from daedalus.analysis.run_results import (
 from daedalus.learner.reporting.metrics_rows import ENV, USER
 from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.settings import changed_settings, setting_text, value_text
+from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
 from daedalus.protocol.texts import printable
 
 _STYLE = Path(__file__).with_name("report_style.css")
@@ -86,6 +87,7 @@ def run_page(group: Group[RunRecord], by: str) -> str:
         video_section(record),
         evaluation_section(record),
         _curves([group], by),
+        orders_section(record),
         failure_section(record),
         settings_section(record),
         versions_section(record),
@@ -94,7 +96,7 @@ def run_page(group: Group[RunRecord], by: str) -> str:
 
 
 def comparison_page(
-    groups: Sequence[Group[RunRecord]],
+    environments: Sequence[Sequence[Group[RunRecord]]],
     by: str,
     *,
     threshold: float | None,
@@ -103,27 +105,41 @@ def comparison_page(
     """Return the report of several runs.
 
     Args:
-      groups: the runs, one curve for each group.
+      environments: the runs of each environment, one curve for each group.
       by: horizontal axis of the curves, "env_steps" or "minutes".
       threshold: mean return to reach, for the table (default: the target return of the runs).
       left_out: one line for each run that could not be read.
     """
+    groups = [group for groups in environments for group in groups]
     runs = [run for group in groups for run in group.runs]
-    comparison = comparison_of(groups, threshold)
-    environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
-    title = f"{len(runs)} runs of {environment}" if environment else f"{len(runs)} runs"
+    several = len(environments) > 1
+    played = f"{len(environments)} environments" if several else environment_of(groups)
+    title = f"{len(runs)} runs of {played}" if played else f"{len(runs)} runs"
     unfinished = [run.unfinished for run in runs if run.unfinished]
+    sections = [_environment_sections(each, by, threshold, named=several) for each in environments]
     return _document(
         title,
         _header(title, [f"{len(groups)} groups" if len(groups) > 1 else "1 group"], None),
         [element("p", line, class_="note") for line in [*left_out, *unfinished]],
-        return_section(groups, by),
-        comparison_section(comparison),
-        _curves(groups, by),
-        runs_section(groups),
-        differences_section(groups),
+        sections,
         versions_of_runs_section(groups),
     )
+
+
+def _environment_sections(
+    groups: Sequence[Group[RunRecord]], by: str, threshold: float | None, *, named: bool
+) -> list[ET.Element | None]:
+    """Return what a report of several runs shows of one environment, under its name if there are several."""
+    environment = environment_of(groups) or "unknown environment"
+    heading = element("h2", environment, class_="environment") if named else None
+    return [
+        heading,
+        return_section(groups, by, environment if named else ""),
+        comparison_section(comparison_of(groups, threshold)),
+        _curves(groups, by, environment if named else ""),
+        runs_section(groups),
+        differences_section(groups),
+    ]
 
 
 def section(title: str, *content: Child) -> ET.Element:
@@ -247,6 +263,18 @@ def video_section(record: RunRecord) -> ET.Element | None:
     if video.media_type == "image/gif":
         return section("Video", element("img", src=source, alt=name, class_="video"))
     return section("Video", element("video", src=source, controls=True, loop=True, muted=True, aria_label=name))
+
+
+def orders_section(record: RunRecord) -> ET.Element | None:
+    """Return the orders of operators and who gave them; None without any."""
+    given = [each for each in record.events if each.text.startswith((ORDERED_BY, DRAINED_BY, STOPPED_BY))]
+    if not given:
+        return None
+    rows = [(each.time, each.actor or "the run", each.kind, each.text) for each in given[-_MOST_EVENTS:]]
+    more = len(given) - len(rows)
+    left_out = element("p", f"{more:,} earlier ones are in events.jsonl.", class_="muted") if more > 0 else None
+    listed = table(("at (UTC)", "about", "event", "order"), rows, label="orders of operators")
+    return section("Orders of operators", listed, left_out)
 
 
 def failure_section(record: RunRecord) -> ET.Element:
@@ -415,8 +443,8 @@ def versions_of_runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element |
     return section("Versions", table(head, rows, label="versions"))
 
 
-def return_section(groups: Sequence[Group], by: str) -> ET.Element:
-    """Return the chart of the return, large, with its explanation."""
+def return_section(groups: Sequence[Group], by: str, of: str = "") -> ET.Element:
+    """Return the chart of the return, large, with its explanation; `of` tells charts of the page apart."""
     several = len(groups) > 1 or len(groups[0].runs) > 1
     band = "The band is one standard deviation of the newest episodes, circles are evaluations."
     if several:
@@ -427,7 +455,7 @@ def return_section(groups: Sequence[Group], by: str) -> ET.Element:
     # Two sizes, so that texts have the same size on a wide and on a narrow page: each shows one of them.
     sizes = (("on-wide", LARGE), ("on-narrow", SMALL))
     drawn = [
-        element("div", line_chart(_TITLES[RETURN], lines, unit=by, colours=colours, size=size), class_=name)
+        element("div", line_chart(_named(_TITLES[RETURN], of), lines, unit=by, colours=colours, size=size), class_=name)
         for name, size in sizes
         if lines
     ]
@@ -440,15 +468,22 @@ def return_section(groups: Sequence[Group], by: str) -> ET.Element:
     )
 
 
-def _curves(groups: Sequence[Group], by: str) -> ET.Element | None:
-    """Return a chart of each other column of the metrics that has values, or None if there is none."""
+def _named(title: str, of: str) -> str:
+    return f"{of}: {title}" if of else title
+
+
+def _curves(groups: Sequence[Group], by: str, of: str = "") -> ET.Element | None:
+    """Return a chart of each other column of the metrics that has values, or None if there is none.
+
+    `of` tells charts of the page apart.
+    """
     columns = {name for group in groups for run in group.runs for name in run.metrics}
     own = sorted(name for name in columns if name.startswith((ENV, USER)))[:_MOST_OWN]
     charts = []
     for column, title in {**_TITLES, **{name: name for name in own}}.items():
         lines, colours = _lines(groups, column, by)
         if column != RETURN and any(series.y.any() for series in lines):  # all 0: nothing of the kind happened
-            charts.append(_figure(title, line_chart(title, lines, unit=by, colours=colours)))
+            charts.append(_figure(title, line_chart(_named(title, of), lines, unit=by, colours=colours)))
     return section("Learning curves", element("div", charts, class_="charts")) if charts else None
 
 

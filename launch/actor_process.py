@@ -8,6 +8,7 @@ causes that somebody else can remove, so it reports them and tries again.
 import logging
 import secrets
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -150,6 +151,7 @@ def _serve_run(
     on_join: Callable[[Welcome], None],
 ) -> bool:
     """Take part in one run; return whether the run finished. Raises what `main` reports."""
+    config = replace(config, searched_since=time.monotonic())
     transport = connect_with_retry(options.connect, stop, config.timeout, credentials)
     if transport is None:
         return False

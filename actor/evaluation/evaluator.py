@@ -110,6 +110,7 @@ class Evaluator:
 
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
+        self._thread.call(self._session.end_waiting)
         self._on_join(welcome)
         spec, wanted, confirms = welcome.spec, welcome.spec.evaluation, welcome.confirm_episodes > 0
         interval = wanted.seconds or _DEFAULT_SECONDS

@@ -21,12 +21,13 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import one_line, policy_lag, printable, short_number
-from daedalus.transport.connecting import connect_until_interrupted
+from daedalus.transport.connecting import connect_once
 from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.status_query import ask, ask_events, no_answer
+from daedalus.transport.status_query import ask, ask_events, no_answer, waiting_actors
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
+_MOST_WAITING = 20  # names of actors that wait for a run
 _FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0  # between two looks
 _WIDTH = 100  # characters of a line of the state
 _WRAPPER = TextWrapper(_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
@@ -99,24 +100,27 @@ def status(arguments: list[str]) -> int:
     try:
         if parsed.watch:
             return _watch(parsed, credentials)
-        transport = connect_until_interrupted(parsed.connect, credentials)
+        transport = connect_once(parsed.connect, credentials)
         try:
             statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
             unanswered = "" if statuses else no_answer(transport, parsed.run)
+            waiting = list(waiting_actors(transport))
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
         print_error("status", error)
         return NO_ANSWER
     if not statuses:
-        print_error("status", unanswered)
+        print_error("status", f"{unanswered}{_waiting(waiting)}")
         return NO_ANSWER
     if parsed.quiet:
         _show_problems(statuses)
     else:
         for shown in filter(None, pages) if parsed.events else statuses:
-            say(_json(shown) if parsed.json else _text(shown))
+            say(_json(shown, waiting) if parsed.json else _text(shown))
+        if waiting and not (parsed.json or parsed.events):
+            say(_waiting(waiting).removeprefix("; "))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
 
 
@@ -124,7 +128,7 @@ def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
     screen = Screen()
     frames = screen.shows_frames and not parsed.json
     shown = _json if parsed.json else _text
-    connect = partial(connect_until_interrupted, parsed.connect, credentials)
+    connect = partial(connect_once, parsed.connect, credentials)
     watch_status(connect, parsed.run, screen, shown, frames=frames)
     return HEALTHY
 
@@ -144,19 +148,32 @@ def watch_status(
     Raises TransportError if the learner refuses this process, or if its answers are damaged.
     """
     wanted = "no learner" if run == keys.ANY_RUN else f"no learner of run {run!r}"
-    nobody, waiting = f"{wanted} answers at this address; waiting for one (Ctrl-C ends)", False
+    nobody = f"{wanted} answers at this address"
+    reason, said = nobody, ""  # why no run is shown, and what the user has read of it
+
+    def open_transport() -> Transport:
+        nonlocal reason
+        try:
+            transport = connect()
+        except TransportError as error:
+            reason = str(error)
+            raise
+        reason = nobody
+        return transport
+
     with suppress(KeyboardInterrupt):
         try:
-            for runs in looks(connect, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+            for runs in looks(open_transport, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+                waiting = "" if runs else f"{reason}; waiting for one (Ctrl-C ends)"
                 if frames and runs:
                     screen.show(runs)
                 elif frames:
-                    screen.say(nobody)
-                elif not runs and not waiting:
-                    screen.err(f"daedalus status: {nobody}")
+                    screen.say(waiting)
+                elif waiting and waiting != said:
+                    screen.err(f"daedalus status: {waiting}")
                 for each in runs if not frames else ():
                     screen.out(text(each.status))
-                waiting = not runs
+                said = waiting
         finally:
             screen.end()
 
@@ -185,9 +202,19 @@ def _show_problems(statuses: list[RunStatus]) -> None:
             say(one_line(f"{status.run}: {problem}"))
 
 
-def _json(shown: RunStatus | EventsPage) -> str:
-    """Return JSON in ASCII: texts of peers cannot command a terminal."""
-    return json.dumps(shown.model_dump(mode="json"))
+def _json(shown: RunStatus | EventsPage, waiting: Sequence[str] = ()) -> str:
+    """Return JSON in ASCII: texts of peers cannot command a terminal. `waiting` are actors that wait for a run."""
+    more = {"waiting_actors": list(waiting)} if isinstance(shown, RunStatus) else {}
+    return json.dumps({**shown.model_dump(mode="json"), **more})
+
+
+def _waiting(names: Sequence[str]) -> str:
+    """Return which actors wait for a run, as the end of a sentence."""
+    if not names:
+        return ""
+    more = f" and {len(names) - _MOST_WAITING:,} more" if len(names) > _MOST_WAITING else ""
+    actors = "1 actor waits" if len(names) == 1 else f"{len(names):,} actors wait"
+    return f"; {actors} for a run: {', '.join(names[:_MOST_WAITING])}{more}"
 
 
 def _text(shown: RunStatus | EventsPage) -> str:
@@ -227,6 +254,7 @@ def _table(status: RunStatus) -> list[str]:
         f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
+        *([f"  last order at {status.last_order}"] if status.last_order else []),
         *_actor_table(status),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
@@ -240,7 +268,7 @@ _Cell = Callable[[ActorStatus, RunStatus], str]
 # Columns of the table of actors, each with its cell. A column in which no actor has anything is left out: "-" or "".
 _COLUMNS: dict[str, _Cell] = {
     "actor": lambda actor, _: printable(actor.actor),
-    "state": lambda actor, _: "quarantined" if actor.quarantined else "alive" if actor.alive else "gone",
+    "state": lambda actor, _: _state(actor),
     "seen": lambda actor, _: f"{actor.seconds_since_seen:.1f} s",
     "lives": lambda actor, _: f"{actor.lives}" if actor.lives > 1 else "-",
     "envs": lambda actor, _: f"{actor.environments}",
@@ -256,6 +284,12 @@ _COLUMNS: dict[str, _Cell] = {
 }
 _LEFT = ("actor", "state")  # columns of words
 _LEAST_IMPORTANT = ("down", "MB/h up", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy")
+
+
+def _state(actor: ActorStatus) -> str:
+    if actor.quarantined:
+        return "quarantined"
+    return "gone" if not actor.alive else "leaving" if actor.drained_by else "alive"
 
 
 def _actor_table(status: RunStatus) -> list[str]:
@@ -284,7 +318,8 @@ def _busy_share(actor: ActorStatus) -> float:
 
 def _actor_texts(actor: ActorStatus) -> list[str]:
     rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
-    return [*([f"rejected: {rejected}"] if rejected else []), *_client_texts(actor)]
+    drained = [f"leaves: drained by {actor.drained_by}"] if actor.drained_by and actor.alive else []
+    return [*drained, *([f"rejected: {rejected}"] if rejected else []), *_client_texts(actor)]
 
 
 def _places(actors: Sequence[ActorStatus]) -> list[str]:

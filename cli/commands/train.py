@@ -306,8 +306,9 @@ def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: boo
         with output:
             streams = output.unlimited_pipes if live else inherited
             return run_locally(run, stopping, output, streams, show_end).status
-    except RunStoppedError:
-        left, how = _left_report(directory), f"stopped; continue with: {resume_command(run)}"
+    except RunStoppedError as error:
+        by = f" by {error}" if str(error) else ""
+        left, how = _left_report(directory), f"stopped{by}; continue with: {resume_command(run)}"
         show("\n".join(filter(None, [left, how])), command)
         return 1
     except RunFailedError as error:

@@ -28,7 +28,7 @@ def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
             keys.status(status.run),
             lambda request: request.reply(encode(answers.get(request.size, EventsReport(page=events_page())))),
         )
-        connect = "daedalus.cli.commands.status.connect_until_interrupted"
+        connect = "daedalus.cli.commands.status.connect_once"
         monkeypatch.setattr(connect, lambda *_: MemoryTransport(network))
         assert status_command([*CONNECT, *options]) == (3 if status.problems else 0)
         return capsys.readouterr().out
