@@ -175,7 +175,7 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     page.get_by_role("button", name="Stop the run").click()
     page.get_by_role("dialog").get_by_role("button", name="Stop the run").click()
     assert process.wait() == 1, process.output
-    assert "stopped; continue with: daedalus resume run" in process.output
+    assert "; continue with: daedalus resume run" in process.output
     page.wait_for_selector("#notices:has-text('The gateway has ended, too')")
     assert page.locator("#state").get_attribute("data-state") == "stopped"
     assert "Continue it with: daedalus resume run" in text_of(page, "#notices")
