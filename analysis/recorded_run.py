@@ -80,10 +80,27 @@ class RecordedRun:
         if ended and (steps is None or done <= steps):
             return ""
         running = is_locked(self.directory)
-        remedy = "it is still running" if running else f"continue it with: {self.command('resume')}"
+        remedy = "it is still running" if running else f"continue it with: {self.resume_command}"
         author = self.summary.get("stopped_by")
         stopped = f", stopped by {bounded_text(author)}" if isinstance(author, str) and not running else ""
         return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps){stopped}: {remedy}"
+
+    @property
+    def resume_command(self) -> str:
+        """Command that continues the run."""
+        modules = {} if self.spec is None else self.spec.user_modules
+        return shlex.join(["daedalus", "resume", str(self.directory), *allow_settings(modules)])
+
+    @property
+    def evaluate_command(self) -> str:
+        """Command that evaluates the run."""
+        modules = {} if self.environment is None else self.environment.user_modules
+        return shlex.join(["daedalus", "evaluate", str(self.directory), *allow_settings(modules)])
+
+    @property
+    def record_command(self) -> str:
+        """Command that evaluates the run and records the result in its directory."""
+        return f"{self.evaluate_command} --record"
 
     @property
     def evaluation_return(self) -> float | None:
@@ -103,6 +120,18 @@ class RecordedRun:
         return self.settings.get("training.target_return")
 
     @property
+    def spec(self) -> RunSpec | None:
+        """The settings; None if this release does not know them."""
+        sections: dict[str, dict[str, Any]] = {}
+        for key, value in self.settings.items():
+            section, _, name = key.partition(".")
+            sections.setdefault(section, {})[name] = value
+        try:
+            return RunSpec.model_validate(sections)
+        except ValidationError:
+            return None
+
+    @property
     def environment(self) -> EnvironmentSpec | None:
         """Settings of the environment; None if this release does not know them."""
         values = {
@@ -112,34 +141,6 @@ class RecordedRun:
             return EnvironmentSpec.model_validate(values)
         except ValidationError:
             return None
-
-    def command(self, name: str, *words: str, path: str = "") -> str:
-        """Return the line that gives this run to a command, with the modules that the command has to be allowed.
-
-        Args:
-          name: "train", "resume" or "evaluate".
-          words: further words.
-          path: of a file in the directory, in place of the directory.
-        """
-        allowed = self._modules if name != "evaluate" else self.environment.user_modules if self.environment else {}
-        return shlex.join(["daedalus", name, str(self.directory / path), *words, *allow_settings(allowed)])
-
-    @property
-    def record_command(self) -> str:
-        """Command that evaluates the run and records the result in its directory."""
-        return self.command("evaluate", "--record")
-
-    @property
-    def _modules(self) -> dict[str, str]:
-        """Settings that name a module; none if this release does not know the settings."""
-        sections: dict[str, dict[str, Any]] = {}
-        for path, value in self.settings.items():
-            section, _, key = path.partition(".")
-            sections.setdefault(section, {})[key] = value
-        try:
-            return RunSpec.model_validate(sections).user_modules
-        except ValidationError:
-            return {}
 
     @property
     def trains_true_task(self) -> bool:
@@ -237,12 +238,16 @@ def _settings(path: Path) -> dict[str, Any]:
         settings = run_spec(settings).model_dump(mode="json")
     except SettingsError:  # another release may have had settings that this one does not have
         settings = json.loads(json.dumps(settings, default=str))  # TOML has dates, too
+    return {path: value for path, value in _flat(settings).items() if _is_usable(path, value)}
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of all sections by `section.key`."""
     return {
         f"{section}.{key}": value
         for section, values in settings.items()
         if isinstance(values, dict)
         for key, value in values.items()
-        if _is_usable(f"{section}.{key}", value)
     }
 
 

@@ -6,6 +6,7 @@ comes from outside cannot become markup.
 
 import base64
 import math
+import shlex
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -350,12 +351,12 @@ def repeat_section(record: RunRecord) -> ET.Element:
     origin = record.versions.get("init_from")
     others = ["--allow-other-spaces"] if record.versions.get("init_from_other_spaces") else []
     begun = ["--init-from", origin, *others] if origin else []
-    commands = [record.command("train", *begun, path=CONFIG), record.command("evaluate")]
+    train = shlex.join(["daedalus", "train", str(record.directory / CONFIG), *begun])
     trust = "The run has code of its author: allow its modules only if you trust that code."
     return section(
         "Do it again",
-        element("pre", "\n".join(commands), tabindex=0),
-        element("p", trust, class_="note") if "--allow-module" in commands[0] else None,
+        element("pre", f"{train}\n{record.evaluate_command}", tabindex=0),
+        element("p", trust, class_="note") if "--allow-module" in record.evaluate_command else None,
     )
 
 
@@ -376,7 +377,9 @@ def comparison_section(comparison: Comparison | None) -> ET.Element:
     explained = [element("li", line) for line in notes(comparison)]
     return section(
         "Comparison",
-        table(header(comparison), rows, label="comparison of the groups", numeric=range(1, 7)),
+        table(
+            header(comparison), rows, label=f"comparison of the groups of {comparison.environment}", numeric=range(1, 7)
+        ),
         element("ul", explained, class_="muted"),
     )
 
@@ -402,7 +405,7 @@ def runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element:
                     failures or "none",
                 )
             )
-    return section("Runs", table(head, rows, label="runs", numeric=(2, 4, 5, 6, 7)))
+    return section("Runs", table(head, rows, label=f"runs of {environment_of(groups)}", numeric=(2, 4, 5, 6, 7)))
 
 
 def _evaluated(record: RunRecord) -> str:
@@ -419,7 +422,7 @@ def differences_section(groups: Sequence[Group]) -> ET.Element | None:
     if not rows:
         return None
     head = ("setting", *(group.name for group in groups))
-    return section("Settings that differ", table(head, rows, label="settings that differ"))
+    return section("Settings that differ", table(head, rows, label=f"settings of {environment_of(groups)} that differ"))
 
 
 def _values(group: Group, key: str) -> str:

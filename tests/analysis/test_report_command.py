@@ -102,7 +102,7 @@ def test_a_report_shows_evaluation_curves_settings_and_versions(folder: Path) ->
     assert "daedalus train run/config.toml" in text
 
 
-def test_the_return_is_first_and_settings_at_their_defaults_are_collapsed(folder: Path) -> None:
+def test_the_return_is_first(folder: Path) -> None:
     run = evaluated(record(folder / "run"))
     assert report(["run"]) == 0
     page = (run / "report.html").read_text()
@@ -111,30 +111,33 @@ def test_the_return_is_first_and_settings_at_their_defaults_are_collapsed(folder
     assert (
         page.index("return of the training episodes") < page.index("episodes by return") < page.index("entropy (nats)")
     )
-    shown, _, collapsed = page[page.index("Settings that differ") :].partition("<details>")
-    assert "target_return" in shown
-    assert "stop_when_solved" not in shown  # the preset leaves it
-    assert "stop_when_solved" in collapsed
 
 
-def test_the_commands_of_a_report_work_as_they_are(folder: Path) -> None:
-    """They allow the modules that the run names, and begin with the same weights."""
-    own = ("environment.id=corridor:Corridor-v0", "policy.encoder=parts:Encoder")
-    run = record(folder / "run", settings=own, evaluation=None)
+def test_settings_that_are_the_defaults_are_collapsed(folder: Path) -> None:
+    run = record(folder / "run", settings=["collection.window=7"])
+    assert report(["run"]) == 0
+    chosen, others = (run / "report.html").read_text().split("settings at their defaults")
+    shown, hidden = (
+        re.findall(r'<th scope="row">(\w+)</th>', part) for part in (chosen, others.split("</details>")[0])
+    )
+    assert {"id", "window", "target_return", "learning_rate"} <= set(shown)
+    assert {"discount_factor", "action_repeat"} <= set(hidden)
+    assert not {"discount_factor", "action_repeat"} & set(shown)
+    assert not {"id", "window"} & set(hidden)
+
+
+def test_commands_allow_the_modules_of_a_run_and_begin_with_its_weights(folder: Path) -> None:
+    settings = ["environment.id=corridor:Corridor-v0", "policy.encoder=layers:Net"]
+    run = record(folder / "run", settings=settings, evaluation=None, finished=False)
     versions = json.loads((run / "versions.json").read_text())
     origin = {"init_from": "/runs/first one", "init_from_other_spaces": True}
     (run / "versions.json").write_text(json.dumps({**versions, **origin}))
     assert report(["run"]) == 0
     text = Page(run / "report.html").text
-    assert (
-        "daedalus train run/config.toml --init-from '/runs/first one' --allow-other-spaces "
-        "--allow-module corridor --allow-module parts\ndaedalus evaluate run --allow-module corridor The run"
-    ) in text
-    assert "only if you trust that code" in text
-    assert "daedalus evaluate run --record --allow-module corridor" in text
-    (run / "summary.json").unlink()
-    assert report(["run"]) == 0
-    assert "daedalus resume run --allow-module corridor --allow-module parts" in Page(run / "report.html").text
+    train = "daedalus train run/config.toml --init-from '/runs/first one' --allow-other-spaces"
+    assert f"{train}\ndaedalus evaluate run --allow-module corridor The run has code" in text
+    assert "daedalus evaluate run --allow-module corridor --record" in text
+    assert "continue it with: daedalus resume run --allow-module corridor --allow-module layers" in text
 
 
 def test_a_histogram_counts_the_episodes(folder: Path) -> None:
