@@ -375,6 +375,12 @@ class RunRecord(RecordedRun):
         return "solved" if self.summary.get("solved") else "finished"
 
     @property
+    def bottleneck(self) -> str:
+        """What the run waited for, in one line; empty if it is not known."""
+        text = self.summary.get("bottleneck")
+        return bounded_text(text) if isinstance(text, str) else ""
+
+    @property
     def rejected(self) -> dict[str, int]:
         """Rejected rollouts of a run that has a summary, by cause."""
         causes = self.summary.get("rollouts_rejected")

@@ -84,6 +84,7 @@ def run_page(group: Group[RunRecord], by: str) -> str:
         _header(record.name, facts, record.status),
         element("p", unfinished, class_="note") if unfinished else None,
         summary_tiles(record),
+        element("p", record.bottleneck, class_="muted") if record.bottleneck else None,
         return_section([group], by),
         video_section(record),
         evaluation_section(record),

@@ -47,6 +47,7 @@ export class Summary {
     const plays = /^CartPole-v[01]$/.test(status.environment) && !OVER.has(state);
     byId("play").hidden = !plays || !this.takesClients;
     this.#progress(status);
+    setText(byId("bottleneck"), state === "running" ? status.bottleneck : "");
     this.tiles();
     document.title = `${status.run}: ${number(status.episode_return_mean)} - Daedalus`;
   }
@@ -104,7 +105,7 @@ export class Summary {
     );
     this.#tile("env_steps/s", number(status.env_steps_per_second), `${number(status.updates_per_second)} updates/s`);
     const [lag, inUpdates] = policyLag(status.policy_lag_mean, status.updates_per_batch);
-    this.#tile("Policy lag", lag, `${inUpdates ? `${inUpdates}, ` : ""}mean of the last second`);
+    this.#tile("Policy lag", lag, `${inUpdates ? `${inUpdates}, ` : ""}mean of the newest batches`);
     const absent = [[status.actors_quarantined, "quarantined"], [status.actors_gone, "gone"]];
     const others = absent.filter(([count]) => count).map(([count, what]) => `${whole(count)} ${what}`);
     this.#tile("Actors", whole(status.actors_alive), others.join(", ") || "none gone");
