@@ -193,7 +193,7 @@ class RunReporter:
             refused_joins=fleet.refused_joins.report(now),
             actors=page(fleet, "", now),
             updates_per_batch=spec.training.updates_per_batch,
-            **self._agent_steps(),
+            agent_steps=counters.agent_steps if spec.environment.is_game else None,
             bottleneck=self._bottleneck,
             learning_share=rates.learning_share,
             decoding_share=rates.decoding_share,
