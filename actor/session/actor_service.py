@@ -75,6 +75,10 @@ class ActorService:
         """End a wait for a rollout of the collector. From any thread."""
         self._thread.notify(self._note_rollout)
 
+    def leave(self, by: float) -> None:
+        """Finish and upload the present rollout, then end `run`; at the latest at a monotonic time. From any thread."""
+        self._thread.notify(self._session.leave, by)
+
     def _note_rollout(self) -> None:
         self._session.rollout_ready = True
 

@@ -11,7 +11,7 @@ from typing import Never
 
 from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.actor_config import ActorConfig
-from daedalus.actor.session.conversation import Conversation, Steps, Wait, WatchPresence
+from daedalus.actor.session.conversation import LEAVES, Conversation, RunOverError, Steps, Wait, WatchPresence
 from daedalus.actor.session.snapshots import FetchSchedule, SnapshotFeed
 from daedalus.actor.session.uploading import ACTOR_PAUSE_SECONDS, CLIENT_PAUSE_SECONDS, Pace, Reports, Uploads
 from daedalus.protocol import keys
@@ -29,6 +29,7 @@ _SLOW_SECONDS, _SLOW_ROLLOUTS = 0.25, 3  # the first rollout of an environment m
 _SLOW_LINK_WINDOW = 4  # most rollouts in flight on a slow link, unless the run asks for more
 _CONFIRMATIONS = 4  # requests for a newer snapshot within the largest age of the policy
 _REFRESH_SECONDS = 0.2  # while a client fills a rollout, and between requests for a confirmation
+_UPLOAD_SECONDS = 5.0  # of the time to leave, for the last rollout to reach the learner
 _MANY_REJECTIONS = 20  # warn after this many consecutive rejections
 
 
@@ -163,6 +164,7 @@ class ActorSession(PolicySession):
     Attributes:
       rollout_ready: set this when a client has filled a rollout.
       sequence: number of the next rollout in this learner epoch.
+      rows: rows of the present rollout that have begun. Whoever performs `Collect` counts them.
     """
 
     def __init__(
@@ -175,6 +177,7 @@ class ActorSession(PolicySession):
         self.uploads = Uploads(config.name, self.heard)
         self.rollout_ready = False
         self.sequence = 0
+        self._plays = self._is_collecting = False
         self._schedule = FetchSchedule()
         self._pace, self._is_filling = Pace(), False  # whether a client fills a rollout
         pause = ACTOR_PAUSE_SECONDS if report is None else CLIENT_PAUSE_SECONDS
@@ -198,6 +201,7 @@ class ActorSession(PolicySession):
                 yield from self._play_with(welcome)
             except LearnerLostError as error:
                 _logger.info("%s", error)
+                self._plays = self._is_collecting = False
 
     # ------------------------------------------------------------------------------- what ends a session, and waits
 
@@ -208,6 +212,19 @@ class ActorSession(PolicySession):
         """
         super().check_over()
         self.uploads.check_over()
+
+    def check_leave(self, by: float) -> None:
+        """See Conversation. The present rollout is finished and its verdict awaited, if there is time for both."""
+        unjudged, lost = len(self.uploads.in_flight.rollouts), list[str]()
+        if self._is_collecting:
+            if self.now < by - _UPLOAD_SECONDS:
+                return
+            lost.append(f"the rollout under way is lost ({self._pace.rows_played:,} rows in each environment)")
+        elif self._plays and unjudged and self.now < by:
+            return
+        if unjudged:
+            lost.append(f"{unjudged:,} uploaded rollouts had no verdict yet, and may be lost")
+        raise RunOverError(f"{LEAVES}: {'; '.join(lost) or 'no rollout is lost'}")
 
     def check(self) -> None:
         """Raise if there is a reason to stop collecting: see Conversation, and Uploads."""
@@ -232,7 +249,7 @@ class ActorSession(PolicySession):
     def due_times(self) -> list[float | None]:
         """See PolicySession."""
         in_flight_at = self.uploads.in_flight.next_due()
-        return [*super().due_times(), in_flight_at, self._reports.next_at, self._confirmation_due()]
+        return [*super().due_times(), self.leave_by, in_flight_at, self._reports.next_at, self._confirmation_due()]
 
     def _confirmation_due(self) -> float | None:
         """Return when to ask whether the policy is the newest; None if its age does not matter."""
@@ -273,6 +290,7 @@ class ActorSession(PolicySession):
         """Collect and upload until something raises: the session's end, or an error."""
         synchronous, window = spec.algorithm.synchronous, spec.collection.window
         yield from self._await_newer(-1)
+        self._plays = True
         if not synchronous:
             self.feed.use_fetches()
         while True:
@@ -280,12 +298,17 @@ class ActorSession(PolicySession):
             # Before collecting, so that the rollout is of the newest policy.
             yield from self.wait(lambda: self.uploads.in_flight.has_room)
             self._warn_of_rejections()
+            if self.leave_by is not None:
+                yield from self.wait(lambda: False)  # until `check_leave` raises
             if not synchronous:
                 yield from self._await_fetch(self.now - began_waiting)
             yield self._load()
             began = self.now
             self._pace.begin_rollout(self.now)
-            payload = yield Encode((yield from self._collect()))
+            self._is_collecting = True
+            rollout = yield from self._collect()
+            self._is_collecting = False
+            payload = yield Encode(rollout)
             self._pace.end_rollout(self.now)
             if self.config.link == "auto" and self._slow_rollouts >= _SLOW_ROLLOUTS:
                 self.feed.use_differences()  # they cost the learner little
@@ -367,7 +390,7 @@ class ActorSession(PolicySession):
         """
         self._pace.begin_row(now)
         self._is_fetch_due = self._schedule.is_due(now)
-        return self._is_fetch_due or now >= self._reports.next_at
+        return self._is_fetch_due or self.leave_by is not None or now >= self._reports.next_at
 
     def act_in_rollout(self) -> None:
         """Request the snapshot of the next rollout if it is due, and report. Raises as `check_over` does."""

@@ -239,9 +239,14 @@ class Pace:
         )
 
     @property
+    def rows_played(self) -> int:
+        """Rows of the newest rollout that are complete."""
+        return max(self.rows - self._begun_rows - 1, 0)
+
+    @property
     def _expected(self) -> float:
         """How long the first rollout will take, by its rows so far; 0 before two of them."""
-        rows = self.rows - self._begun_rows - 1
+        rows = self.rows_played
         return (self._row_at - self._began) / rows * self._rollout_length if rows > 0 else 0.0
 
 

@@ -46,7 +46,7 @@ examples:
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
-lag is how old the policy of an actor's newest rollout was: the actors play while the learner trains, so one or two
+lag is how old the policy of an actor's newest rollout was: the actors play while the learner trains, so a few
 batches are normal. epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts
 rollouts, down counts snapshots. A c marks an actor that fetches compact snapshots. rollout is how long an actor takes
 for one, waits how long it then waits for the learner and the network, trip the round trip of a small request.

@@ -27,13 +27,17 @@ class Progress:
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
         self._rewriting = False
 
-    def show(self, row: Mapping[str, float]) -> None:
-        """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds."""
+    def show(self, row: Mapping[str, float], waits_for: str = "") -> None:
+        """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds.
+
+        `waits_for` is what the first batch waits for: without it, the row has no figures. Empty: there is a batch.
+        """
         if not self._terminal:
             if time.monotonic() < self._next_line:
                 return
             self._next_line = time.monotonic() + _LINE_SECONDS
         parts = _parts(row, self._budget, self._updates_per_batch)
+        parts = [parts[0], waits_for, parts[-1]] if waits_for else parts
         if self._terminal:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
             self._write(f"\r\x1b[K{line}")
@@ -61,7 +65,7 @@ class Progress:
 class SilentProgress(Progress):
     """Progress of a run that another process shows."""
 
-    def show(self, row: Mapping[str, float]) -> None:
+    def show(self, row: Mapping[str, float], waits_for: str = "") -> None:
         """Show nothing."""
 
 

@@ -3,6 +3,7 @@
 import logging
 import math
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +77,10 @@ class RunReporter:
         assert self._recorder is not None
         row = self.row(learner, now, last=last)
         self._context.history.add(row)
-        self._recorder.record(row, self._details(learner, now, last=last))
+        details = self._details(learner, now, last=last)
+        # Until there is a batch, this is all that is known.
+        waits_for = "" if "updates_per_second" in row else self._bottleneck
+        self._recorder.record(row, replace(details, waits_for=waits_for))
         if not last and (hint := self._hint()):
             _logger.warning("%s", hint)
 
