@@ -19,10 +19,11 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import FAILED
+from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import Credentials, certificate_days_left
+from daedalus.transport.credentials import Credentials, certificate_days_left, run_for
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall
@@ -274,9 +275,9 @@ class CertificateDays:
 class StatusCollector:
     """Collector that queries the learners at each scrape. The timeout of the query bounds the time of a scrape."""
 
-    def __init__(self, certificates: CertificateDays | None = None) -> None:
-        """Construct the collector. `certificates`: those to report besides the learners'."""
-        self._certificates = certificates or CertificateDays([], None)
+    def __init__(self, certificates: CertificateDays | None = None, run: str = keys.ANY_RUN) -> None:
+        """Construct the collector of a run, or of all; `certificates` are those to report too."""
+        self._certificates, self._run = certificates or CertificateDays([], None), run
         self.transport: Transport | None = None  # None until a router answers
         self.unanswered = False  # whether no learner answered the last scrape
         self._warned = False  # that not all actors have series
@@ -286,7 +287,7 @@ class StatusCollector:
         statuses = []
         if self.transport is not None:
             with contextlib.suppress(TransportError, ProtocolError):
-                statuses = ask(self.transport, max_actors=_MAX_ACTORS)
+                statuses = ask(self.transport, self._run, max_actors=_MAX_ACTORS)
         self.unanswered = not statuses
         self._warn_of_large_fleet(statuses)
         yield from metrics(statuses)
@@ -315,7 +316,7 @@ def serve_metrics(
     """Serve the status of the learners at a host and port until `stop` is set, and return the exit status."""
     host, port = listener
     certificates = CertificateDays(endpoints, credentials)
-    collector, registry = StatusCollector(certificates), CollectorRegistry()
+    collector, registry = StatusCollector(certificates, run_for(credentials, keys.ANY_RUN)), CollectorRegistry()
     registry.register(collector)
     try:
         server = MetricsServer(host, port, registry)
