@@ -4,7 +4,6 @@ import json
 import logging
 import math
 import signal
-import subprocess
 import tempfile
 import threading
 import time
@@ -15,7 +14,7 @@ from typing import Any
 
 from daedalus.launch.child_output import STREAMS, ChildOutput
 from daedalus.launch.local_run import LocalRun, evaluation_arguments
-from daedalus.launch.supervision import start, stop
+from daedalus.launch.supervision import Child, StartPlayer, start, stop
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
@@ -71,13 +70,16 @@ class EvaluationFailedError(Exception):
 class EvaluationProcess:
     """One `daedalus evaluate`. The caller closes it."""
 
-    def __init__(self, arguments: Sequence[str], name: str, output: ChildOutput, *, shown: bool) -> None:
+    def __init__(
+        self, arguments: Sequence[str], name: str, output: ChildOutput, start: StartPlayer, *, shown: bool
+    ) -> None:
         """Start the process.
 
         Args:
           arguments: of `daedalus evaluate`.
           name: of the process, different from that of every other one that runs.
           output: reads what it writes.
+          start: starts the process.
           shown: show its progress.
         """
         self._name, self._output = name, output
@@ -91,13 +93,14 @@ class EvaluationProcess:
             raise
 
     @property
-    def process(self) -> subprocess.Popen[bytes]:
+    def process(self) -> Child:
         """The child process."""
         return self._process
 
     def result(self) -> dict[str, Any]:
         """Return the result of a process that has ended. Raises EvaluationFailedError if it failed."""
-        status = self._process.returncode
+        status = self._process.poll()
+        assert status is not None
         self._file.seek(0)
         text = self._file.read()
         if status == 0 and text:
@@ -121,7 +124,9 @@ def _died(status: int) -> str:
     return f"the environment or one of its libraries ended an evaluation ({how}): play it with `daedalus check`"
 
 
-def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutput) -> list[dict[str, Any]]:
+def play(
+    commands: list[list[str]], stopping: threading.Event, output: ChildOutput, start: StartPlayer = start
+) -> list[dict[str, Any]]:
     """Run `daedalus evaluate` once for each list of arguments, all at the same time, and return the results.
 
     The progress of the first one is shown. Raises EvaluationFailedError.
@@ -130,7 +135,7 @@ def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutp
     try:
         for arguments in commands:
             name = f"evaluation-{len(evaluations)}"
-            evaluations.append(EvaluationProcess(arguments, name, output, shown=not evaluations))
+            evaluations.append(EvaluationProcess(arguments, name, output, start, shown=not evaluations))
         while any(evaluation.process.poll() is None for evaluation in evaluations):
             if stopping.wait(_POLL_SECONDS):
                 raise EvaluationFailedError
@@ -166,6 +171,7 @@ def select_best(
     options: list[str],
     stopping: threading.Event,
     output: ChildOutput,
+    start: StartPlayer = start,
 ) -> list[dict[str, Any]]:
     """Re-evaluate the candidates, save their new scores, and return the scores, the best first.
 
@@ -175,6 +181,7 @@ def select_best(
       options: options for each `daedalus evaluate`.
       stopping: ends the evaluations early when it is set.
       output: reads what the evaluations write. It shows the progress of the first one.
+      start: starts each process.
 
     Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
     Raises EvaluationFailedError.
@@ -190,7 +197,7 @@ def select_best(
         backend,
     )
     options = [*options, "--backend", backend, "--seed", str(seed)]
-    results = play([[str(each.directory), *options] for each in finalists], stopping, output)
+    results = play([[str(each.directory), *options] for each in finalists], stopping, output, start)
     scores = []
     for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
@@ -216,15 +223,16 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
     began = time.monotonic()
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
     options = ["--episodes", str(run.spec.evaluation.final_episodes), *evaluation_arguments(run)]
-    chosen = select_best(run.directory, run.spec, options, stopping, output)
-    (evaluation,) = play([[str(run.directory), *options]], stopping, output)
+    chosen = select_best(run.directory, run.spec, options, stopping, output, run.start_player)
+    (evaluation,) = play([[str(run.directory), *options]], stopping, output, run.start_player)
     confirmed = summary.get("confirmation") is not None  # by sampled episodes
     can_differ = run.spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
     true_task = run.spec.environment.trains_true_task
     if not true_task and summary.get("episode_return_mean") is not None:
         evaluation["notes"].append(other_task_note(summary["episode_return_mean"]))
     if true_task and not confirmed and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
-        (sampled,) = play([[str(run.directory), *options, "--actions", "sampled"]], stopping, output)
+        commands = [[str(run.directory), *options, "--actions", "sampled"]]
+        (sampled,) = play(commands, stopping, output, run.start_player)
         evaluation["notes"].append(sampled_note(evaluation, sampled))
         summary["sampled_evaluation"] = without_episodes(sampled)
     summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)

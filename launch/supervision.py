@@ -5,11 +5,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from daedalus.launch.child_output import OpenStreams, Streams, inherited
+from daedalus.launch.forked_process import ForkedProcess
 from daedalus.launch.process_lifecycle import STOPPED, interrupts_held
 
 GATEWAY = "gateway"  # name of its process
@@ -70,6 +72,17 @@ def start(
         )
 
 
+Child = subprocess.Popen[bytes] | ForkedProcess
+
+
+class StartPlayer(Protocol):
+    """Function that starts a process which makes environments. See `start`."""
+
+    def __call__(self, module: str, *arguments: str, streams: Streams, one_thread: bool = False) -> Child:
+        """Start the process."""
+        ...
+
+
 class FailedError(Exception):
     """Error of a process that failed too often. `reason` says why, as far as it is known."""
 
@@ -88,14 +101,14 @@ class Supervised:
     """Process that is restarted when it dies before its work is done."""
 
     name: str
-    begin: Callable[[bool], subprocess.Popen[bytes]]  # starts the process; the argument is True for the first start
+    begin: Callable[[bool], Child]  # starts the process; the argument is True for the first start
     ended: Set[int]  # exit statuses that mean that the work is done
     # Exit statuses of a process that has not failed by itself, and how it ended.
     no_fault: Mapping[int, str] = field(default_factory=lambda: _LEARNERS_RESTARTS)
     reason: Callable[[int], str] = _reason  # of its last failure, from the exit status
     restarts: int = 0
     failures: int = 0  # in a row, each soon after the start
-    process: subprocess.Popen[bytes] = field(init=False)
+    process: Child = field(init=False)
     _started: float = field(init=False)
     _ended_at: float | None = None
 
@@ -160,6 +173,7 @@ def supervised_actor(
     options: tuple[str, ...] = (),
     open_streams: OpenStreams = inherited,
     last_error: Callable[[str], str] = lambda _: "",
+    start: StartPlayer = start,
 ) -> Supervised:
     """Start an actor, or the evaluator, under supervision.
 
@@ -169,9 +183,10 @@ def supervised_actor(
       options: further options of `daedalus actor`.
       open_streams: where its output goes.
       last_error: returns the last line of standard error of a process by its name; it says why an actor failed.
+      start: starts the process.
     """
 
-    def begin(_first: bool) -> subprocess.Popen[bytes]:
+    def begin(_first: bool) -> Child:
         arguments = ["--connect", connect, "--name", name, *options]
         with open_streams(name) as streams:
             process = start("daedalus.cli.commands.actor", *arguments, streams=streams, one_thread=True)
@@ -189,7 +204,7 @@ def supervised_actor(
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:
     """Start the gateway of a run under supervision, at an address of this machine, for whoever watches the run."""
 
-    def begin(_first: bool) -> subprocess.Popen[bytes]:
+    def begin(_first: bool) -> Child:
         arguments = ["--connect", connect, "--or-any-port", *options]
         with open_streams(GATEWAY) as streams:
             process = start("daedalus.cli.commands.gateway", *arguments, streams=streams, one_thread=True)
@@ -199,14 +214,14 @@ def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: Ope
     return Supervised(GATEWAY, begin, ended={0}, no_fault={})
 
 
-def _yield_to_learner(process: subprocess.Popen[bytes]) -> None:
+def _yield_to_learner(process: Child) -> None:
     """Let the learner run first."""
     with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
         niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
         os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
 
 
-def stop(processes: list[subprocess.Popen[bytes]], grace_seconds: float = _GRACE_SECONDS) -> None:
+def stop(processes: Sequence[Child], grace_seconds: float = _GRACE_SECONDS) -> None:
     """End processes: send SIGTERM to all, wait, then kill those that are left."""
     for process in processes:
         if process.poll() is None:

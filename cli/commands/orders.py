@@ -143,7 +143,7 @@ def _give(
         print_error(command, error)
         return status_at_start(error)
     try:
-        transport = connect_once(parsed.connect, credentials, vars(parsed).get("timeout"))
+        transport = connect_once(parsed.connect, credentials, getattr(parsed, "timeout", None))
         try:
             order(transport, Operator.here(credentials))
         except KeyboardInterrupt:

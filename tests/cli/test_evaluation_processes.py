@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.launch import final_evaluation
 from daedalus.launch.child_output import ChildOutput, Streams
 from daedalus.launch.final_evaluation import EvaluationFailedError, play
 
@@ -22,14 +21,11 @@ from daedalus.launch.final_evaluation import EvaluationFailedError, play
         ("import os; os.kill(os.getpid(), 9)", r"was killed \(signal 9\): check whether .* lack of memory"),
     ],
 )
-def test_a_process_that_ends_without_a_result_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, reason: str
-) -> None:
-    def start(_module: str, *_arguments: str, streams: Streams) -> subprocess.Popen[bytes]:
+def test_a_process_that_ends_without_a_result_is_named(tmp_path: Path, program: str, reason: str) -> None:
+    def start(module: str, *arguments: str, streams: Streams, one_thread: bool = False) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-S", "-c", program]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=streams.stdout, stderr=streams.stderr)
 
-    monkeypatch.setattr(final_evaluation, "start", start)
     output = ChildOutput(tmp_path / "output.log", print, print)
     with pytest.raises(EvaluationFailedError, match=reason):
-        play([["RUN_DIR"]], threading.Event(), output)
+        play([["RUN_DIR"]], threading.Event(), output, start)
