@@ -235,7 +235,7 @@ class CertificateDays:
     def __init__(self, endpoints: list[str], credentials: Credentials | None) -> None:
         self._endpoints = [] if credentials is None else endpoints
         self._credentials = credentials
-        self._learners: dict[str, tuple[float, float]] = {}  # by run: when it expires, and when the learner answered
+        self._learners: dict[str, tuple[float, float]] = {}  # by run: the days left, and when the learner said so
         self._listeners: dict[str, PeerCertificate] = {}  # by address
 
     def follow(self, stop: threading.Event) -> None:
@@ -250,11 +250,11 @@ class CertificateDays:
 
     def metric(self, runs: Iterable[RunStatus]) -> Metric:
         """Return the days as one metric; those of a learner also for a week after it has gone."""
-        now = time.time()
+        now = time.monotonic()
         for run in runs:
             if run.certificate_days_left is not None:
                 self._learners.pop(run.run, None)
-                self._learners[run.run] = now + run.certificate_days_left * _DAY, now
+                self._learners[run.run] = run.certificate_days_left, now
         self._learners = {
             run: known for run, known in list(self._learners.items())[-_MAX_RUNS:] if now < known[1] + _KEPT_SECONDS
         }
@@ -263,8 +263,8 @@ class CertificateDays:
             "Days until a certificate expires; negative if it has expired.",
             labels=["run", "role", "address"],
         )
-        for run, (expires, _) in sorted(self._learners.items()):
-            family.add_metric([run, "learner", ""], (expires - now) / _DAY)
+        for run, (days, said) in sorted(self._learners.items()):
+            family.add_metric([run, "learner", ""], days - (now - said) / _DAY)
         for endpoint, listener in sorted(self._listeners.items()):
             family.add_metric(["", listener.common_name, endpoint], listener.validity.days_left())
         if (own := certificate_days_left(self._credentials)) is not None:
