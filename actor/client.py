@@ -247,6 +247,7 @@ class Client:
         return ClientReport(
             actor=self._config.name,
             incarnation=self._config.incarnation,
+            rows=sum(agent.actions for agent in self.agents),
             deadlines=sum(clock.deadlines for clock in clocks),
             missed_deadlines=sum(clock.missed_deadlines for clock in clocks),
             overridden_actions=sum(agent.overridden_actions for agent in self.agents),

@@ -20,14 +20,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import FAILED
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials, certificate_days_left, run_for
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall
-from daedalus.transport.status_query import ask, newest_of_each_run
+from daedalus.transport.status_query import Survey, newest_of_each_run, survey
 from daedalus.transport.zenoh_session import PeerCertificate, peer_certificate
 
 _logger = logging.getLogger(__name__)
@@ -101,6 +100,11 @@ class MetricsServer(ThreadingMixIn, WSGIServer):
         """Say nothing of a client that has left or was too slow."""
 
 
+def _known_rate(run: RunStatus, rate: float) -> float | None:
+    """Return a rate, or None while the first batch is awaited: 0 means that no update comes any more."""
+    return rate or (0.0 if run.problems else None)
+
+
 _Family = type[CounterMetricFamily] | type[GaugeMetricFamily]
 
 _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], ...] = (
@@ -117,16 +121,33 @@ _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], 
         GaugeMetricFamily,
         "env_steps_per_second",
         "Recent environment steps per second.",
-        lambda run: run.env_steps_per_second,
+        lambda run: _known_rate(run, run.env_steps_per_second),
     ),
     (CounterMetricFamily, "updates", "Optimiser steps.", lambda run: run.updates),
-    (GaugeMetricFamily, "updates_per_second", "Recent optimiser steps per second.", lambda run: run.updates_per_second),
+    (
+        GaugeMetricFamily,
+        "updates_per_second",
+        "Recent optimiser steps per second.",
+        lambda run: _known_rate(run, run.updates_per_second),
+    ),
     (CounterMetricFamily, "updates_skipped", "Updates skipped: gradient not finite.", lambda run: run.updates_skipped),
     (
         GaugeMetricFamily,
         "episode_return_mean",
         "Mean return of the newest episodes.",
         lambda run: run.episode_return_mean,
+    ),
+    (
+        GaugeMetricFamily,
+        "learning_share",
+        "Recent share of the time in which the learner computed updates.",
+        lambda run: run.learning_share,
+    ),
+    (
+        GaugeMetricFamily,
+        "decoding_share",
+        "Recent share of the time in which the learner decoded rollouts.",
+        lambda run: run.decoding_share,
     ),
     (GaugeMetricFamily, "policy_lag_updates", "Recent mean policy lag.", lambda run: run.policy_lag_mean),
     (CounterMetricFamily, "rollouts_accepted", "Rollouts accepted.", lambda run: run.rollouts_accepted),
@@ -147,8 +168,32 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
     (
         GaugeMetricFamily,
         "actor_silence_seconds",
-        "Time since the learner last heard from the actor.",
+        "Time since the last sign of life of the actor: a rollout or a report.",
         lambda actor: actor.seconds_since_seen,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_silence_limit_seconds",
+        "Silence above it is unusual for this actor.",
+        lambda actor: actor.silence_limit_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_rollout_seconds",
+        "Duration of one of its newest rollouts; 0: unknown.",
+        lambda actor: actor.rollout_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_waiting_seconds",
+        "Its wait from one rollout to the next.",
+        lambda actor: actor.waiting_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_round_trip_seconds",
+        "Round trip of a small request; 0: unknown.",
+        lambda actor: actor.round_trip_seconds,
     ),
     (GaugeMetricFamily, "actor_environments", "Environments of the actor.", lambda actor: actor.environments),
     (
@@ -187,8 +232,10 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
 )
 
 
-def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
+def metrics(statuses: Iterable[RunStatus], unread: Iterable[str] = ()) -> Iterator[Metric]:
     """Yield all metrics of the runs that answered, or only `daedalus_up` 0 if no run answered.
+
+    `unread` are runs whose learners answered, but cannot be read: they have one metric.
 
     Actors that are gone have no series of their own. They are only counted, by their state, and after a minute only in
     the counters of the run. Of several learners of one run, the newest has series.
@@ -196,6 +243,10 @@ def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
     statuses = list(statuses)
     runs = newest_of_each_run(statuses)
     yield GaugeMetricFamily("daedalus_up", "1 if a learner answers, else 0.", value=bool(runs))
+    others = GaugeMetricFamily("daedalus_unreadable", "1 for a run whose learner cannot be read.", labels=["run"])
+    for name in unread:
+        others.add_metric([name], 1)
+    yield others
     info = GaugeMetricFamily(
         "daedalus_run_info", "Environment and algorithm of the run.", labels=["run", "environment", "algorithm"]
     )
@@ -284,14 +335,15 @@ class StatusCollector:
 
     def collect(self) -> Iterator[Metric]:
         """Query the learners and return their metrics."""
-        statuses = []
+        found = Survey(statuses=[], unread={})
         if self.transport is not None:
-            with contextlib.suppress(TransportError, ProtocolError):
-                statuses = ask(self.transport, self._run, max_actors=_MAX_ACTORS)
-        self.unanswered = not statuses
-        self._warn_of_large_fleet(statuses)
-        yield from metrics(statuses)
-        yield self._certificates.metric(newest_of_each_run(statuses))
+            with contextlib.suppress(TransportError):
+                found = survey(self.transport, self._run, max_actors=_MAX_ACTORS)
+        self.unanswered = not found.statuses and not found.unread
+        found.log()
+        self._warn_of_large_fleet(found.statuses)
+        yield from metrics(found.statuses, found.unread)
+        yield self._certificates.metric(newest_of_each_run(found.statuses))
 
     def _warn_of_large_fleet(self, statuses: list[RunStatus]) -> None:
         """Warn once if not all actors have series of their own."""
