@@ -267,7 +267,8 @@ class TargetConfirmation:
                 if failure := player.failure():
                     raise PlayerError(failure)
                 self._beat()
-                self._context.health.updated = time.monotonic()  # it works, although it does not train
+                health = self._context.health
+                health.updated = health.awaited_since = time.monotonic()  # it works, although it does not train
         if conversation.report is None:
             raise PlayerError(conversation.failure)
         return conversation.report
