@@ -29,7 +29,13 @@ from daedalus.protocol import keys
 from daedalus.protocol.messages import Welcome
 from daedalus.transport.addresses import socket_path
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect
+from daedalus.transport.credentials import (
+    SECURITY_ERRORS,
+    Credentials,
+    NotValidNowError,
+    credentials_to_connect,
+    run_for,
+)
 from daedalus.transport.interface import TransportError, UnreachableError
 from daedalus.transport.retries import Retries
 
@@ -59,7 +65,7 @@ class ActorOptions:
     allowed_modules: frozenset[str] = frozenset()
 
     def config(self, credentials: Credentials | None) -> ActorConfig:
-        """Return the checked configuration. Raises ValueError with a message of one line."""
+        """Return the checked configuration. Raises ValueError or CredentialsError with a message of one line."""
         if self.environments is not None and not 1 <= self.environments <= 4096:
             raise ValueError(f"--envs is {self.environments}: choose a number from 1 to 4096")
         if self.run != keys.ANY_RUN:
@@ -73,7 +79,7 @@ class ActorOptions:
         return ActorConfig(
             name=keys.check_name(name, "actor name"),
             incarnation=secrets.randbits(62),
-            run=self.run,
+            run=run_for(credentials, self.run),
             environments=self.environments,
             runtime=self.runtime,
             modules=UserModules(self.allowed_modules, "the learner"),

@@ -11,7 +11,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daedalus.actor.errors import ActorError
@@ -27,7 +27,14 @@ from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys
 from daedalus.transport.addresses import AddressError, check_listening
-from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect, load
+from daedalus.transport.credentials import (
+    SECURITY_ERRORS,
+    Credentials,
+    NotValidNowError,
+    credentials_to_connect,
+    load,
+    run_for,
+)
 from daedalus.transport.interface import TransportError
 from daedalus.transport.retries import Retries
 
@@ -131,6 +138,7 @@ def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
             if options.run != keys.ANY_RUN:
                 keys.check_name(options.run, "run")
             chosen = _Chosen.of(options)
+            options = replace(options, run=run_for(chosen.operator, run_for(chosen.credentials, options.run)))
             host, port = _listening_address(options.listen, chosen.serving is not None, options.insecure)
             break
         except NotValidNowError as error:

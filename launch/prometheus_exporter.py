@@ -19,9 +19,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import FAILED
+from daedalus.protocol import keys
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import Credentials, certificate_days_left
+from daedalus.transport.credentials import Credentials, certificate_days_left, run_for
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall
@@ -285,7 +286,7 @@ class CertificateDays:
     def __init__(self, endpoints: list[str], credentials: Credentials | None) -> None:
         self._endpoints = [] if credentials is None else endpoints
         self._credentials = credentials
-        self._learners: dict[str, tuple[float, float]] = {}  # by run: when it expires, and when the learner answered
+        self._learners: dict[str, tuple[float, float]] = {}  # by run: the days left, and when the learner said so
         self._listeners: dict[str, PeerCertificate] = {}  # by address
 
     def follow(self, stop: threading.Event) -> None:
@@ -300,11 +301,11 @@ class CertificateDays:
 
     def metric(self, runs: Iterable[RunStatus]) -> Metric:
         """Return the days as one metric; those of a learner also for a week after it has gone."""
-        now = time.time()
+        now = time.monotonic()
         for run in runs:
             if run.certificate_days_left is not None:
                 self._learners.pop(run.run, None)
-                self._learners[run.run] = now + run.certificate_days_left * _DAY, now
+                self._learners[run.run] = run.certificate_days_left, now
         self._learners = {
             run: known for run, known in list(self._learners.items())[-_MAX_RUNS:] if now < known[1] + _KEPT_SECONDS
         }
@@ -313,8 +314,8 @@ class CertificateDays:
             "Days until a certificate expires; negative if it has expired.",
             labels=["run", "role", "address"],
         )
-        for run, (expires, _) in sorted(self._learners.items()):
-            family.add_metric([run, "learner", ""], (expires - now) / _DAY)
+        for run, (days, said) in sorted(self._learners.items()):
+            family.add_metric([run, "learner", ""], days - (now - said) / _DAY)
         for endpoint, listener in sorted(self._listeners.items()):
             family.add_metric(["", listener.common_name, endpoint], listener.validity.days_left())
         if (own := certificate_days_left(self._credentials)) is not None:
@@ -325,9 +326,9 @@ class CertificateDays:
 class StatusCollector:
     """Collector that queries the learners at each scrape. The timeout of the query bounds the time of a scrape."""
 
-    def __init__(self, certificates: CertificateDays | None = None) -> None:
-        """Construct the collector. `certificates`: those to report besides the learners'."""
-        self._certificates = certificates or CertificateDays([], None)
+    def __init__(self, certificates: CertificateDays | None = None, run: str = keys.ANY_RUN) -> None:
+        """Construct the collector of a run, or of all; `certificates` are those to report too."""
+        self._certificates, self._run = certificates or CertificateDays([], None), run
         self.transport: Transport | None = None  # None until a router answers
         self.unanswered = False  # whether no learner answered the last scrape
         self._warned = False  # that not all actors have series
@@ -337,7 +338,7 @@ class StatusCollector:
         found = Survey(statuses=[], unread={})
         if self.transport is not None:
             with contextlib.suppress(TransportError):
-                found = survey(self.transport, max_actors=_MAX_ACTORS)
+                found = survey(self.transport, self._run, max_actors=_MAX_ACTORS)
         self.unanswered = not found.statuses and not found.unread
         found.log()
         self._warn_of_large_fleet(found.statuses)
@@ -367,7 +368,7 @@ def serve_metrics(
     """Serve the status of the learners at a host and port until `stop` is set, and return the exit status."""
     host, port = listener
     certificates = CertificateDays(endpoints, credentials)
-    collector, registry = StatusCollector(certificates), CollectorRegistry()
+    collector, registry = StatusCollector(certificates, run_for(credentials, keys.ANY_RUN)), CollectorRegistry()
     registry.register(collector)
     try:
         server = MetricsServer(host, port, registry)

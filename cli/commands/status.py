@@ -23,7 +23,7 @@ from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, Run
 from daedalus.protocol.texts import one_line, policy_lag, printable, short_duration, short_number, short_rate
 from daedalus.transport.certificate_expiry import WARNING_DAYS
 from daedalus.transport.connecting import connect_once
-from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect, run_for
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.status_query import ask_events, no_answer, survey, waiting_actors
 
@@ -96,6 +96,7 @@ def status(arguments: list[str]) -> int:
         return _check_alive(parsed.alive)
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
+        parsed.run = run_for(credentials, parsed.run)
     except SECURITY_ERRORS as error:
         print_error("status", error)
         return status_at_start(error)
