@@ -1,26 +1,33 @@
-"""The evaluation after training: selection of the best checkpoint, then the final episodes, by `daedalus evaluate`."""
+"""The evaluation after training: selection of the best checkpoint, then the final episodes, played by evaluators."""
 
-import json
 import logging
 import math
-import signal
-import subprocess
-import tempfile
+import os
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
-from daedalus.launch.child_output import STREAMS, ChildOutput
-from daedalus.launch.local_run import LocalRun, evaluation_arguments
-from daedalus.launch.supervision import start, stop
+import numpy as np
+
+from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.local_run import LocalRun, helper_log_words
+from daedalus.launch.supervision import private_evaluators
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.candidates import candidates
-from daedalus.protocol.spec import RunSpec
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, OfferedPolicy, play
+from daedalus.policy.saving.best_checkpoints import best_score, is_best, is_best_in_training, rescore
+from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, candidates, find_policy
+from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_modules import allow_settings
+from daedalus.protocol.messages import EvaluationReport, Program
+from daedalus.protocol.spec import Backend, EnvironmentSpec
 from daedalus.protocol.texts import short_number
+from daedalus.transport.interface import TransportError
 
+_logger = logging.getLogger(__name__)
+
+# Added to the seed of the run, so that neither training nor another evaluation uses these seeds.
+_FINAL_SEEDS, _SELECTION_SEEDS = 2**32, 2**33
 _ERRORS = 3.0  # standard errors between two means that differ
 _FEWEST = 10  # episodes, from which on their standard error means something
 
@@ -60,85 +67,8 @@ def _error(evaluation: dict[str, Any]) -> float:
     return evaluation["return_std"] / math.sqrt(evaluation["episodes"])
 
 
-_POLL_SECONDS = 0.05
-_REPORTED = (1, 2)  # exit statuses of a `daedalus evaluate` that has printed the reason
-
-
 class EvaluationFailedError(Exception):
-    """Error of an evaluation that failed or was stopped. The message holds output that was not printed yet."""
-
-
-class EvaluationProcess:
-    """One `daedalus evaluate`. The caller closes it."""
-
-    def __init__(self, arguments: Sequence[str], name: str, output: ChildOutput, *, shown: bool) -> None:
-        """Start the process.
-
-        Args:
-          arguments: of `daedalus evaluate`.
-          name: of the process, different from that of every other one that runs.
-          output: reads what it writes.
-          shown: show its progress.
-        """
-        self._name, self._output = name, output
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in close)
-        try:
-            with output.pipes(name, shown=STREAMS if shown else ()) as streams:
-                own = replace(streams, stdout=self._file.fileno())
-                self._process = start("daedalus.cli.commands.evaluate", *arguments, "--json", streams=own)
-        except BaseException:
-            self._file.close()
-            raise
-
-    @property
-    def process(self) -> subprocess.Popen[bytes]:
-        """The child process."""
-        return self._process
-
-    def result(self) -> dict[str, Any]:
-        """Return the result of a process that has ended. Raises EvaluationFailedError if it failed."""
-        status = self._process.returncode
-        self._file.seek(0)
-        text = self._file.read()
-        if status == 0 and text:
-            return json.loads(text)
-        # The environment may have printed much: the error is at the end.
-        lines = self._output.unshown(self._name)
-        reported = status in _REPORTED and self._output.last_error(self._name)
-        raise EvaluationFailedError("\n".join(lines if reported else [*lines, _died(status)]))
-
-    def close(self) -> None:
-        """End the process if it still runs."""
-        stop([self._process])
-        self._file.close()
-
-
-def _died(status: int) -> str:
-    """Return the error of an evaluation whose process ended without a result, from its exit status."""
-    if status == -getattr(signal, "SIGKILL", 9):
-        return "an evaluation was killed (signal 9): check whether it was killed for lack of memory"
-    how = f"signal {-status}" if status < 0 else f"status {status}"
-    return f"the environment or one of its libraries ended an evaluation ({how}): play it with `daedalus check`"
-
-
-def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutput) -> list[dict[str, Any]]:
-    """Run `daedalus evaluate` once for each list of arguments, all at the same time, and return the results.
-
-    The progress of the first one is shown. Raises EvaluationFailedError.
-    """
-    evaluations: list[EvaluationProcess] = []
-    try:
-        for arguments in commands:
-            name = f"evaluation-{len(evaluations)}"
-            evaluations.append(EvaluationProcess(arguments, name, output, shown=not evaluations))
-        while any(evaluation.process.poll() is None for evaluation in evaluations):
-            if stopping.wait(_POLL_SECONDS):
-                raise EvaluationFailedError
-        return [evaluation.result() for evaluation in evaluations]
-    finally:
-        stop([evaluation.process for evaluation in evaluations])  # all at the same time
-        for evaluation in evaluations:
-            evaluation.close()
+    """Error of an evaluation that failed, with the reason, or was stopped, without one."""
 
 
 def without_episodes(result: dict[str, Any]) -> dict[str, Any]:
@@ -155,55 +85,93 @@ def evaluation_summary(evaluation: dict[str, Any], **more: Any) -> dict[str, Any
     }
 
 
-_logger = logging.getLogger(__name__)
+class FinalEpisodes:
+    """The episodes after training, played by evaluators."""
 
-_SEEDS = 2**33  # added to the seed of the run, so that neither training nor the final evaluation uses these seeds
+    def __init__(self, run: LocalRun, stopping: threading.Event, output: ChildOutput) -> None:
+        """Construct what plays the episodes.
 
+        Args:
+          run: which has been trained.
+          stopping: ends the evaluations early when it is set.
+          output: reads what the evaluators print. It shows the progress of the first one.
+        """
+        self._run, self._stopping, self._output = run, stopping, output
 
-def select_best(
-    directory: Path,
-    spec: RunSpec,
-    options: list[str],
-    stopping: threading.Event,
-    output: ChildOutput,
-) -> list[dict[str, Any]]:
-    """Re-evaluate the candidates, save their new scores, and return the scores, the best first.
-
-    Args:
-      directory: the run directory.
-      spec: the specification of the run.
-      options: options for each `daedalus evaluate`.
-      stopping: ends the evaluations early when it is set.
-      output: reads what the evaluations write. It shows the progress of the first one.
-
-    Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
-    Raises EvaluationFailedError.
-    """
-    finalists = candidates(directory)
-    if len(finalists) < 2:
-        return []
-    backend, seed = spec.environment.backend, spec.training.seed + _SEEDS
-    _logger.info(
-        "selecting the best of %d checkpoints: %d episodes each on %s",
-        len(finalists),
-        spec.evaluation.final_episodes,
-        backend,
-    )
-    options = [*options, "--backend", backend, "--seed", str(seed)]
-    results = play([[str(each.directory), *options] for each in finalists], stopping, output)
-    scores = []
-    for candidate, result in zip(finalists, results, strict=True):
-        version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
-        before = ""
-        if candidate.score is not None:
-            before = f" ({short_number(candidate.score)} {'in training' if candidate.of_training else 'before'})"
-        _logger.info("  policy version %d: %s +- %s%s", version, short_number(mean), short_number(std), before)
+    def play(
+        self, policies: list[SavedPolicy], backend: Backend, seed: int, actions: Literal["greedy", "sampled"]
+    ) -> list[tuple[dict[str, Any], EvaluationReport]]:
+        """Return the result and the report of each policy. Raises EvaluationFailedError."""
+        run, environment = self._run, _environment(self._run.spec.environment, backend)
+        plan = EpisodePlan(
+            run=run_directory.run_name(run.directory),
+            spec=run.spec,
+            environment=environment,
+            spaces=policies[0].spaces,
+            episodes=run.spec.evaluation.final_episodes,
+            seed=run.spec.training.seed + seed,
+            actions=actions,
+        )
+        names = [f"evaluation-{number}" for number in range(min(len(policies), os.cpu_count() or 1))]
+        options = *helper_log_words(run.logs), *allow_settings(environment.user_modules)
+        start = partial(private_evaluators, names, options, self._output)
         try:
-            candidate.rescore(mean)
-        except OSError as error:
-            _logger.warning("  the score of policy version %d could not be saved: %s", version, error.strerror or error)
-        scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
-    return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
+            reports = play(plan, [_offered(each) for each in policies], start, lambda: not self._stopping.is_set())
+        except (EvaluatorError, TransportError, OSError) as error:
+            raise EvaluationFailedError(str(error)) from None
+        if reports is None:
+            raise EvaluationFailedError
+        return [
+            (plan.result(policy.directory, report), report) for policy, report in zip(policies, reports, strict=True)
+        ]
+
+    def select_best(self) -> list[dict[str, Any]]:
+        """Re-evaluate the candidates, save their new scores, and return the scores, the best first.
+
+        The episodes are those of the training's backend: a selection by the score on the final backend would make that
+        score the best of several.
+
+        Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
+        Raises EvaluationFailedError.
+        """
+        run, finalists = self._run, candidates(self._run.directory)
+        if len(finalists) < 2:
+            return []
+        backend, episodes = run.spec.environment.backend, run.spec.evaluation.final_episodes
+        text = "selecting the best of %d checkpoints: %d episodes each on %s"
+        _logger.info(text, len(finalists), episodes, backend)
+        played = self.play(finalists, backend, _SELECTION_SEEDS, run.spec.evaluation.actions)
+        scores = []
+        for policy, (result, _) in zip(finalists, played, strict=True):
+            version, mean, std = policy.policy_version, result["return_mean"], result["return_std"]
+            before = ""
+            if is_best(policy.directory):
+                when = "in training" if is_best_in_training(policy.directory) else "before"
+                before = f" ({short_number(best_score(policy.directory))} {when})"
+            _logger.info("  policy version %d: %s +- %s%s", version, short_number(mean), short_number(std), before)
+            try:
+                rescore(policy.directory, mean, version)
+            except OSError as error:
+                reason = error.strerror or error
+                _logger.warning("  the score of policy version %d could not be saved: %s", version, reason)
+            scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
+        return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
+
+
+def _environment(trained: EnvironmentSpec, backend: Backend) -> EnvironmentSpec:
+    """Return the environment to play."""
+    if backend == trained.backend:
+        return trained.as_evaluated()
+    from daedalus.launch.evaluation import evaluated_environment  # imports gymnasium, which this process seldom needs
+
+    return evaluated_environment(trained, backend)
+
+
+def _offered(policy: SavedPolicy) -> OfferedPolicy:
+    from daedalus.policy.acting.runtime import program_hash  # imports onnxruntime
+
+    program = Program(hash=program_hash(policy.program), model=np.frombuffer(policy.program, np.uint8))
+    return OfferedPolicy(policy_version=policy.policy_version, program=program, weights=policy.weights)
 
 
 def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
@@ -215,19 +183,25 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
     """
     began = time.monotonic()
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
-    options = ["--episodes", str(run.spec.evaluation.final_episodes), *evaluation_arguments(run)]
-    chosen = select_best(run.directory, run.spec, options, stopping, output)
-    (evaluation,) = play([[str(run.directory), *options]], stopping, output)
+    episodes, backend = FinalEpisodes(run, stopping, output), run.spec.evaluation.final_backend
+    backend = backend or run.spec.environment.backend
+    chosen = episodes.select_best()
+    try:
+        best = [find_policy(run.directory)]
+    except (NoPolicyError, DamagedError) as error:
+        raise EvaluationFailedError(str(error)) from None
+    ((evaluation, report),) = episodes.play(best, backend, _FINAL_SEEDS, run.spec.evaluation.actions)
     confirmed = summary.get("confirmation") is not None  # by sampled episodes
     can_differ = run.spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
     true_task = run.spec.environment.trains_true_task
     if not true_task and summary.get("episode_return_mean") is not None:
         evaluation["notes"].append(other_task_note(summary["episode_return_mean"]))
     if true_task and not confirmed and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
-        (sampled,) = play([[str(run.directory), *options, "--actions", "sampled"]], stopping, output)
+        ((sampled, _),) = episodes.play(best, backend, _FINAL_SEEDS, "sampled")
         evaluation["notes"].append(sampled_note(evaluation, sampled))
-        summary["sampled_evaluation"] = without_episodes(sampled)
+        summary["sampled_evaluation"] = sampled
     summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)
+    evaluation |= {"returns": report.returns.tolist(), "lengths": report.lengths.tolist()}
     run_directory.write_json(run.directory / run_directory.EVALUATION, evaluation)
     run_directory.write_json(run.directory / run_directory.SUMMARY, summary)
     return summary

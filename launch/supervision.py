@@ -1,16 +1,22 @@
 """Supervision of child processes: start them, restart them if they die, and end all of them."""
 
+import logging
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Set
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 
-from daedalus.launch.child_output import OpenStreams, Streams, inherited
+from daedalus.launch.child_output import ChildOutput, OpenStreams, Streams, inherited
 from daedalus.launch.process_lifecycle import STOPPED, interrupts_held
+from daedalus.learner.serving.evaluator_host import Evaluators
+from daedalus.transport.private_address import private_address
+
+_logger = logging.getLogger(__name__)
 
 GATEWAY = "gateway"  # name of its process
 # Exit status that means something for a learner only.
@@ -93,6 +99,7 @@ class Supervised:
     # Exit statuses of a process that has not failed by itself, and how it ended.
     no_fault: Mapping[int, str] = field(default_factory=lambda: _LEARNERS_RESTARTS)
     reason: Callable[[int], str] = _reason  # of its last failure, from the exit status
+    most_restarts: int = _MOST_RESTARTS
     restarts: int = 0
     failures: int = 0  # in a row, each soon after the start
     process: subprocess.Popen[bytes] = field(init=False)
@@ -141,8 +148,11 @@ class Supervised:
         self.failures += -status in _CRASHES if status < 0 else status not in self.no_fault
         if self.failures >= _MOST_FAILURES:
             raise FailedError(self.name, self.reason(status), f"failed {self.failures} times")
-        if self.restarts >= _MOST_RESTARTS:
-            raise FailedError(self.name, f"it {self._describe(status)}", f"was started {self.restarts} times")
+        if self.restarts >= self.most_restarts:
+            memory = "; check whether it was for lack of memory" if status == -getattr(signal, "SIGKILL", 9) else ""
+            raise FailedError(
+                self.name, f"it {self._describe(status)}{memory}", f"was started {self.restarts + 1} times"
+            )
         self.restarts += 1
         self._start(first=False)
         return f"{self.name} {self._describe(status)}; started again"
@@ -184,6 +194,43 @@ def supervised_actor(
         return said or f"the environment ends the process ({how}): play it with `daedalus check`"
 
     return Supervised(name, begin, ended={0}, no_fault={}, reason=reason)
+
+
+@contextmanager
+def private_evaluators(names: Sequence[str], options: tuple[str, ...], output: ChildOutput) -> Iterator[Evaluators]:
+    """Yield evaluators that nobody else reaches, and end them. Raises TransportError or OSError.
+
+    Args:
+      names: of the evaluators. What the first one prints is shown.
+      options: further options of `daedalus actor`.
+      output: reads what they print.
+    """
+    from daedalus.transport.connecting import listen  # imports zenoh
+
+    with private_address() as address, closing(listen([address])) as transport:
+        started: list[Supervised] = []
+
+        def failure(dismissed: Set[str]) -> str:
+            for each in started:
+                try:
+                    restarted = None if each.name in dismissed else each.check()
+                except FailedError as error:
+                    return str(error)
+                if restarted:
+                    _logger.warning("%s", restarted)
+            return ""
+
+        try:
+            for name in names:
+                streams = output.pipes if name == names[0] else partial(output.pipes, shown=())
+                each = supervised_actor(name, address, (*options, "--evaluator"), streams, output.last_error)
+                # Whoever started it ends it: until then, any end is a failure. It plays few episodes: if it is killed
+                # again and again, there is a reason.
+                each.ended, each.most_restarts = frozenset(), _MOST_FAILURES - 1
+                started.append(each)
+            yield Evaluators(transport, failure)
+        finally:
+            stop([each.process for each in started])
 
 
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:

@@ -449,7 +449,7 @@ def test_progress_is_written_to_standard_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1)
-    monkeypatch.setattr("daedalus.launch.evaluation._PROGRESS_SECONDS", 0.0)
+    monkeypatch.setattr("daedalus.actor.evaluation.episodes.PROGRESS_SECONDS", 0.0)
     options = ["--json", "--episodes", "2", "--envs", "1", "--allow-module", "counting_environment"]
     assert main([str(run), *options]) == 0
     captured = capsys.readouterr()

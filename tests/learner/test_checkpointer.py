@@ -15,7 +15,6 @@ from building import POLICY, SPACES, make_rollouts, run_context, run_spec
 from log_lines import LINES
 
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.candidates import candidates
 from daedalus.learner.run.heartbeat import HEARTBEAT, Heartbeat
 from daedalus.learner.run.process_resources import reserve_descriptors
 from daedalus.learner.serving.evaluations import Evaluated
@@ -25,7 +24,7 @@ from daedalus.learner.training.checkpoint import load_checkpoint, load_newest
 from daedalus.learner.training.checkpointer import Checkpointer, Saving
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training, keep_if_best
-from daedalus.policy.saving.saved_policy import checkpoints, find_policy, read_policy
+from daedalus.policy.saving.saved_policy import candidates, checkpoints, find_policy, read_policy
 from daedalus.policy.saving.sealed import SealedDirectory
 from daedalus.protocol.messages import new_epoch
 from daedalus.protocol.spec import RunSpec, TrainingSpec

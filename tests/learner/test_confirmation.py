@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+from plain import vector_spaces
 from processes import LIMIT, until
 
+from daedalus.learner.serving.evaluator_host import Evaluators
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
-from daedalus.learner.target_confirmation import Player, TargetConfirmation, confirmation, mean_interval
+from daedalus.learner.target_confirmation import TargetConfirmation, confirmation, mean_interval
 from daedalus.learner.training.checkpointer import Saving
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -119,7 +121,7 @@ class Scene:
     def __init__(self, directory: Path, play: Play) -> None:
         training = TrainingSpec(target_return=475.0, target_episodes=2, seed=7)
         spec = RunSpec(environment=EnvironmentSpec(id="A-v0"), training=training)
-        self.context = RunContext.begin(directory, spec, threading.Event())
+        self.context = RunContext.begin(directory, spec, threading.Event(), spaces=vector_spaces(2, 4))
         self.play, self.starts, self.failure, self.opened = play, True, "", 0
         publisher = SnapshotPublisher(self.context, MemoryTransport(MemoryNetwork()))
         publisher.offer_program(b"program")
@@ -128,7 +130,7 @@ class Scene:
         self.context.counters.returns.append(480.0)
 
     @contextmanager
-    def _player(self) -> Iterator[Player]:
+    def _player(self) -> Iterator[Evaluators]:
         self.opened += 1
         if not self.starts:
             raise TransportError("no display")
@@ -136,7 +138,7 @@ class Scene:
         thread = threading.Thread(target=self._play, args=[MemoryTransport(network)])
         thread.start()
         try:
-            yield Player(MemoryTransport(network), lambda: self.failure)
+            yield Evaluators(MemoryTransport(network), lambda _: self.failure)
         finally:
             thread.join(LIMIT)
 
@@ -179,7 +181,8 @@ def test_learner_says_what_to_play_and_with_which_policy(tmp_path: Path) -> None
     welcome, snapshot, _ = answers
     assert isinstance(welcome, Welcome)
     assert isinstance(snapshot, Snapshot)
-    assert (welcome.confirm_episodes, welcome.confirm_seed, welcome.run) == (2, 7 + 2**34, scene.context.name)
+    assert (welcome.play_episodes, welcome.play_seed, welcome.run) == (2, 7 + 2**34, scene.context.name)
+    assert welcome.spec.evaluation.actions == "sampled"
     assert (snapshot.policy_version, snapshot.weights["w"].tolist()) == (1, [1.0, 1.0])
     result = scene.confirmation.result
     assert result is not None
@@ -193,6 +196,7 @@ def test_after_an_attempt_training_goes_on_for_as_long_as_it_took(tmp_path: Path
 
     def play(ask: Callable[[str, Any], Message]) -> None:
         threading.Event().wait(0.3)
+        ask(keys.evaluations(scene.context.name, "p"), EvaluationRequest(evaluator="p"))
         ask(keys.evaluations(scene.context.name, "p"), report(value))
 
     scene = Scene(tmp_path, play)
