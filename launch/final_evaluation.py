@@ -117,7 +117,7 @@ class FinalEpisodes:
         start = partial(private_evaluators, names, options, self._output)
         try:
             reports = play(plan, [_offered(each) for each in policies], start, lambda: not self._stopping.is_set())
-        except (EvaluatorError, TransportError, OSError) as error:
+        except (EvaluatorError, TransportError) as error:
             raise EvaluationFailedError(str(error)) from None
         if reports is None:
             raise EvaluationFailedError
