@@ -1,30 +1,42 @@
-"""The evaluation after training: selection of the best checkpoint, then the final episodes, played by evaluators."""
+"""The process of the evaluation after training: it selects the best checkpoint, and lets evaluators play with it."""
 
+import argparse
 import logging
 import math
-import os
+import sys
 import threading
 import time
-from functools import partial
+from contextlib import closing
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.local_run import LocalRun, helper_log_words
-from daedalus.launch.supervision import private_evaluators
+from daedalus.actor.evaluation.episodes import EvaluationStoppedError
+from daedalus.launch.evaluation import evaluated_environment
+from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.process_lifecycle import (
+    FAILED,
+    UNSAVED,
+    UNWRITABLE,
+    exit_on_thread_exceptions,
+    exit_with_parent,
+    stop_on_signals,
+)
 from daedalus.learner.run import run_directory
-from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, OfferedPolicy, play
+from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
+from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.saving.best_checkpoints import best_score, is_best, is_best_in_training, rescore
-from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, candidates, find_policy
+from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, read_candidates
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.messages import EvaluationReport, Program
-from daedalus.protocol.spec import Backend, EnvironmentSpec
+from daedalus.protocol.spec import Backend, RunSpec
 from daedalus.protocol.texts import short_number
-from daedalus.transport.interface import TransportError
+from daedalus.transport.connecting import listen
+from daedalus.transport.interface import Transport, TransportError
 
-_logger = logging.getLogger(__name__)
+_logger = logging.getLogger("daedalus.launch.final_evaluation")  # this module is __main__ in the process
 
 # Added to the seed of the run, so that neither training nor another evaluation uses these seeds.
 _FINAL_SEEDS, _SELECTION_SEEDS = 2**32, 2**33
@@ -67,10 +79,6 @@ def _error(evaluation: dict[str, Any]) -> float:
     return evaluation["return_std"] / math.sqrt(evaluation["episodes"])
 
 
-class EvaluationFailedError(Exception):
-    """Error of an evaluation that failed, with the reason, or was stopped, without one."""
-
-
 def without_episodes(result: dict[str, Any]) -> dict[str, Any]:
     """Return a result of `daedalus evaluate` without the lists of the episodes' returns and lengths."""
     return {name: value for name, value in result.items() if name not in ("returns", "lengths")}
@@ -86,41 +94,35 @@ def evaluation_summary(evaluation: dict[str, Any], **more: Any) -> dict[str, Any
 
 
 class FinalEpisodes:
-    """The episodes after training, played by evaluators."""
+    """The episodes after training, in the process that offers the policies to the evaluators."""
 
-    def __init__(self, run: LocalRun, stopping: threading.Event, output: ChildOutput) -> None:
-        """Construct what plays the episodes.
+    def __init__(self, directory: Path, spec: RunSpec, transport: Transport, stop: threading.Event) -> None:
+        """Construct what lets them be played.
 
         Args:
-          run: which has been trained.
-          stopping: ends the evaluations early when it is set.
-          output: reads what the evaluators print. It shows the progress of the first one.
+          directory: of a run that has been trained.
+          spec: of the run.
+          transport: reaches the evaluators.
+          stop: ends the evaluations early.
         """
-        self._run, self._stopping, self._output = run, stopping, output
+        self._directory, self._spec, self._stop = directory, spec, stop
+        self._host = EvaluatorHost(run_directory.run_name(directory), transport)
 
     def play(
-        self, policies: list[SavedPolicy], backend: Backend, seed: int, actions: Literal["greedy", "sampled"]
+        self, policies: list[SavedPolicy], backend: Backend, seeds: int, actions: Literal["greedy", "sampled"]
     ) -> list[tuple[dict[str, Any], EvaluationReport]]:
-        """Return the result and the report of each policy. Raises EvaluationFailedError."""
-        run, environment = self._run, _environment(self._run.spec.environment, backend)
+        """Return the result and the report of each policy. Raises EvaluatorError and EvaluationStoppedError."""
         plan = EpisodePlan(
-            run=run_directory.run_name(run.directory),
-            spec=run.spec,
-            environment=environment,
+            spec=self._spec,
+            environment=evaluated_environment(self._spec.environment, backend),
             spaces=policies[0].spaces,
-            episodes=run.spec.evaluation.final_episodes,
-            seed=run.spec.training.seed + seed,
+            episodes=self._spec.evaluation.final_episodes,
+            seed=self._spec.training.seed + seeds,
             actions=actions,
         )
-        names = [f"evaluation-{number}" for number in range(min(len(policies), os.cpu_count() or 1))]
-        options = *helper_log_words(run.logs), *allow_settings(environment.user_modules)
-        start = partial(private_evaluators, names, options, self._output)
-        try:
-            reports = play(plan, [_offered(each) for each in policies], start, lambda: not self._stopping.is_set())
-        except (EvaluatorError, TransportError) as error:
-            raise EvaluationFailedError(str(error)) from None
+        reports = self._host.play(plan, [_offered(each) for each in policies], lambda: not self._stop.is_set())
         if reports is None:
-            raise EvaluationFailedError
+            raise EvaluationStoppedError
         return [
             (plan.result(policy.directory, report), report) for policy, report in zip(policies, reports, strict=True)
         ]
@@ -132,16 +134,16 @@ class FinalEpisodes:
         score the best of several.
 
         Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
-        Raises EvaluationFailedError.
+        Raises as `play`.
         """
-        run, finalists = self._run, candidates(self._run.directory)
+        finalists = read_candidates(self._directory)
         if len(finalists) < 2:
             return []
-        backend, episodes = run.spec.environment.backend, run.spec.evaluation.final_episodes
+        backend, evaluation = self._spec.environment.backend, self._spec.evaluation
         text = "selecting the best of %d checkpoints: %d episodes each on %s"
-        _logger.info(text, len(finalists), episodes, backend)
-        played = self.play(finalists, backend, _SELECTION_SEEDS, run.spec.evaluation.actions)
+        _logger.info(text, len(finalists), evaluation.final_episodes, backend)
         scores = []
+        played = self.play(finalists, backend, _SELECTION_SEEDS, evaluation.actions)
         for policy, (result, _) in zip(finalists, played, strict=True):
             version, mean, std = policy.policy_version, result["return_mean"], result["return_std"]
             before = ""
@@ -157,51 +159,66 @@ class FinalEpisodes:
             scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
         return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
 
+    def evaluate(self) -> None:
+        """Select the best checkpoint, play the final episodes with it, and write summary.json and evaluation.json.
 
-def _environment(trained: EnvironmentSpec, backend: Backend) -> EnvironmentSpec:
-    """Return the environment to play."""
-    if backend == trained.backend:
-        return trained.as_evaluated()
-    from daedalus.launch.evaluation import evaluated_environment  # imports gymnasium, which this process seldom needs
-
-    return evaluated_environment(trained, backend)
+        If greedy episodes are clearly worse than training was, the same episodes are played with sampled actions, too,
+        unless the policy is greedy anyway, or sampled episodes have confirmed the target. A note says where training
+        plays another task, whose returns say nothing about these. Raises as `play`, OSError, and as `find_policy`.
+        """
+        began, directory, spec = time.monotonic(), self._directory, self._spec
+        summary = run_directory.read_json(directory / run_directory.SUMMARY)
+        chosen = self.select_best()
+        best, backend = [find_policy(directory)], spec.evaluation.final_backend or spec.environment.backend
+        ((evaluation, report),) = self.play(best, backend, _FINAL_SEEDS, spec.evaluation.actions)
+        confirmed = summary.get("confirmation") is not None  # by sampled episodes
+        can_differ = spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
+        true_task, trained = spec.environment.trains_true_task, summary.get("episode_return_mean")
+        if not true_task and trained is not None:
+            evaluation["notes"].append(other_task_note(trained))
+        if true_task and not confirmed and can_differ and is_below_training(evaluation, trained):
+            ((sampled, _),) = self.play(best, backend, _FINAL_SEEDS, "sampled")
+            evaluation["notes"].append(sampled_note(evaluation, sampled))
+            summary["sampled_evaluation"] = sampled
+        summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)
+        evaluation |= {"returns": report.returns.tolist(), "lengths": report.lengths.tolist()}
+        run_directory.write_json(directory / run_directory.EVALUATION, evaluation)
+        run_directory.write_json(directory / run_directory.SUMMARY, summary)
 
 
 def _offered(policy: SavedPolicy) -> OfferedPolicy:
-    from daedalus.policy.acting.runtime import program_hash  # imports onnxruntime
-
     program = Program(hash=program_hash(policy.program), model=np.frombuffer(policy.program, np.uint8))
     return OfferedPolicy(policy_version=policy.policy_version, program=program, weights=policy.weights)
 
 
-def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
-    """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
-
-    If greedy episodes are clearly worse than training was, the same episodes are played with sampled actions, too,
-    unless the policy is greedy anyway, or sampled episodes have confirmed the target. A note says where training
-    plays another task, whose returns say nothing about these. Raises EvaluationFailedError.
-    """
-    began = time.monotonic()
-    summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
-    episodes, backend = FinalEpisodes(run, stopping, output), run.spec.evaluation.final_backend
-    backend = backend or run.spec.environment.backend
-    chosen = episodes.select_best()
+def main() -> int:
+    """Run the process that offers the policies to the evaluators, and return its exit status."""
+    options = argparse.ArgumentParser()
+    options.add_argument("directory", type=Path)
+    options.add_argument("address")
+    options.add_argument("--log-level", default="info")
+    options.add_argument("--log-json", action="store_true")
+    options.add_argument("--exit-with-parent", action="store_true")
+    parsed = options.parse_args()
+    configure_logging(parsed.log_level, as_json=parsed.log_json)
+    stop = stop_on_signals(exit_if_stuck=True)
+    exit_with_parent(stop)
     try:
-        best = [find_policy(run.directory)]
-    except (NoPolicyError, DamagedError) as error:
-        raise EvaluationFailedError(str(error)) from None
-    ((evaluation, report),) = episodes.play(best, backend, _FINAL_SEEDS, run.spec.evaluation.actions)
-    confirmed = summary.get("confirmation") is not None  # by sampled episodes
-    can_differ = run.spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
-    true_task = run.spec.environment.trains_true_task
-    if not true_task and summary.get("episode_return_mean") is not None:
-        evaluation["notes"].append(other_task_note(summary["episode_return_mean"]))
-    if true_task and not confirmed and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
-        ((sampled, _),) = episodes.play(best, backend, _FINAL_SEEDS, "sampled")
-        evaluation["notes"].append(sampled_note(evaluation, sampled))
-        summary["sampled_evaluation"] = sampled
-    summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)
-    evaluation |= {"returns": report.returns.tolist(), "lengths": report.lengths.tolist()}
-    run_directory.write_json(run.directory / run_directory.EVALUATION, evaluation)
-    run_directory.write_json(run.directory / run_directory.SUMMARY, summary)
-    return summary
+        with closing(listen([parsed.address])) as transport:
+            FinalEpisodes(parsed.directory, run_directory.read_config(parsed.directory), transport, stop).evaluate()
+    except (EvaluatorError, NoPolicyError, DamagedError, SettingsError, TransportError) as error:
+        print_error("train", error)
+        return FAILED
+    except EvaluationStoppedError:
+        return FAILED
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        print_error("train", f"the evaluation could not be saved: {error.strerror}")
+        return UNSAVED
+    return 0
+
+
+if __name__ == "__main__":
+    exit_on_thread_exceptions()
+    sys.exit(main())

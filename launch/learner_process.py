@@ -10,8 +10,8 @@ last checkpoint could not be saved exits with UNSAVED.
 import logging
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
 from daedalus.launch.run_choice import NewRun, with_record
-from daedalus.launch.supervision import private_evaluators
+from daedalus.launch.supervision import evaluators
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
@@ -45,9 +45,9 @@ from daedalus.learner.run.resuming import (
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome, Outputs
-from daedalus.learner.serving.evaluator_host import Evaluators
 from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.serving.run_context import RunContext
+from daedalus.learner.target_confirmation import Player
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import NetworkError, UserModules, allow_settings, allow_words, modules_of, shown_path
@@ -64,6 +64,7 @@ from daedalus.transport.credentials import (
     credentials_to_listen,
 )
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.private_address import private_address
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -71,6 +72,8 @@ if TYPE_CHECKING:
 _logger = logging.getLogger(__name__)
 
 LISTEN = "tcp/127.0.0.1:7447"
+
+_PLAYER = "confirmation"  # name of the process that plays the new episodes
 
 REACHED, NOT_REACHED = 0, 3
 _FAILURES = (
@@ -311,8 +314,7 @@ class LearnerProcess:
         writers = _writers(run.directory, options.rows_to)
         outputs = Outputs(progress=self._progress, writers=writers, user_metrics=self._user_metrics)
         self._context["epoch"] = f"{context.learner_epoch:x}"
-        play = partial(self._evaluators, run, output)
-        return LearnerService(context, transport, outputs, beginning, open_evaluators=play)
+        return LearnerService(context, transport, outputs, beginning, open_player=partial(self._player, run, output))
 
     def _with_spaces(self, run: ChosenRun) -> tuple[ChosenRun, Spaces | None]:
         """Return the run with the default settings of its spaces, and the spaces; None if they are not known here."""
@@ -348,11 +350,18 @@ class LearnerProcess:
             stack.callback(trackers.finish, self._stop)
             trackers.start()
 
-    def _evaluators(self, run: ChosenRun, output: ChildOutput) -> AbstractContextManager[Evaluators]:
-        """Return an evaluator of this host, for the new episodes that confirm the target."""
+    @contextmanager
+    def _player(self, run: ChosenRun, output: ChildOutput) -> Iterator[Player]:
+        """Yield an evaluator of this host, for the new episodes that confirm the target. Raises TransportError."""
         needed = modules_of(run.spec.environment.user_modules)
         allowed = allow_words(module for module in needed if module in run.modules.allowed)
-        return private_evaluators(["confirmation"], (*helper_log_words(self._options.log), *allowed), output)
+        options = *helper_log_words(self._options.log), *allowed
+        with (
+            private_address() as address,
+            closing(listen([address])) as transport,
+            evaluators(address, [_PLAYER], options, output) as failure,
+        ):
+            yield Player(transport, failure)
 
 
 def how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:

@@ -7,14 +7,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 
 from daedalus.launch.child_output import ChildOutput, OpenStreams, Streams, inherited
 from daedalus.launch.process_lifecycle import STOPPED, interrupts_held
-from daedalus.learner.serving.evaluator_host import Evaluators
-from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)
 
@@ -197,40 +195,42 @@ def supervised_actor(
 
 
 @contextmanager
-def private_evaluators(names: Sequence[str], options: tuple[str, ...], output: ChildOutput) -> Iterator[Evaluators]:
-    """Yield evaluators that nobody else reaches, and end them. Raises TransportError or OSError.
+def evaluators(
+    address: str, names: Sequence[str], options: tuple[str, ...], output: ChildOutput
+) -> Iterator[Callable[[], str]]:
+    """Start evaluators of this machine, and end them at the end.
 
     Args:
+      address: private, of an EvaluatorHost.
       names: of the evaluators. What the first one prints is shown.
       options: further options of `daedalus actor`.
       output: reads what they print.
+
+    Yields a function that restarts those that died, and returns why one failed for good, or an empty string.
     """
-    from daedalus.transport.connecting import listen  # imports zenoh
+    started: list[Supervised] = []
 
-    with private_address() as address, closing(listen([address])) as transport:
-        started: list[Supervised] = []
+    def failure() -> str:
+        for each in started:
+            try:
+                restarted = each.check()
+            except FailedError as error:
+                return str(error)
+            if restarted:
+                _logger.warning("%s", restarted)
+        return ""
 
-        def failure(dismissed: Set[str]) -> str:
-            for each in started:
-                try:
-                    restarted = None if each.name in dismissed else each.check()
-                except FailedError as error:
-                    return str(error)
-                if restarted:
-                    _logger.warning("%s", restarted)
-            return ""
-
-        try:
-            for name in names:
-                streams = output.pipes if name == names[0] else partial(output.pipes, shown=())
-                each = supervised_actor(name, address, (*options, "--evaluator"), streams, output.last_error)
-                # Whoever started it ends it: until then, any end is a failure. It plays few episodes: if it is killed
-                # again and again, there is a reason.
-                each.ended, each.most_restarts = frozenset(), _MOST_FAILURES - 1
-                started.append(each)
-            yield Evaluators(transport, failure)
-        finally:
-            stop([each.process for each in started])
+    try:
+        for name in names:
+            streams = output.pipes if name == names[0] else partial(output.pipes, shown=())
+            each = supervised_actor(name, address, (*options, "--evaluator"), streams, output.last_error)
+            # Until the end of the block, every end of a process is a failure. They play few episodes: if one is killed
+            # again and again, there is a reason.
+            each.ended, each.most_restarts = frozenset(), _MOST_FAILURES - 1
+            started.append(each)
+        yield failure
+    finally:
+        stop([each.process for each in started])
 
 
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:

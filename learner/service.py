@@ -19,10 +19,9 @@ from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.resuming import NO_WEIGHTS, Beginning
 from daedalus.learner.run.settings import check_rollout_length, unmeasured_target
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.evaluator_host import Evaluators
 from daedalus.learner.serving.events import EventFile
 from daedalus.learner.serving.run_context import RunContext
-from daedalus.learner.target_confirmation import TargetConfirmation
+from daedalus.learner.target_confirmation import Player, TargetConfirmation
 from daedalus.policy.user_modules import shown_path
 from daedalus.protocol.messages import RunStatus
 from daedalus.transport.interface import Transport
@@ -69,7 +68,7 @@ class LearnerService:
         outputs: Outputs,
         beginning: Beginning = NO_WEIGHTS,
         *,
-        open_evaluators: Callable[[], AbstractContextManager[Evaluators]] | None = None,
+        open_player: Callable[[], AbstractContextManager[Player]] | None = None,
     ) -> None:
         """Construct the service.
 
@@ -78,15 +77,15 @@ class LearnerService:
           transport: the network; the caller closes it.
           outputs: where the metrics of the run go.
           beginning: what the policy begins with.
-          open_evaluators: see TargetConfirmation; None: the newest returns decide alone that the target is reached.
+          open_player: see TargetConfirmation; None: the newest returns decide alone that the target is reached.
         """
         self._context, self._outputs, self._beginning = context, outputs, beginning
         self._heartbeat = Heartbeat(context.directory)
         self._server = ActorServer(context, transport, self._status)
         self._confirmation = None
-        if open_evaluators is not None and context.spec.training.stop_when_solved:
+        if open_player is not None and context.spec.training.stop_when_solved:
             beat = self._heartbeat.beat
-            self._confirmation = TargetConfirmation(context, self._server.publisher, open_evaluators, beat)
+            self._confirmation = TargetConfirmation(context, self._server.publisher, open_player, beat)
         self._reporter = RunReporter(context, outputs.user_metrics)
 
     def run(self) -> Outcome:

@@ -12,15 +12,16 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
-from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, Evaluators, OfferedPolicy, play
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol.messages import EvaluationReport
 from daedalus.protocol.texts import exact_number, short_number
-from daedalus.transport.interface import TransportError
+from daedalus.transport.interface import Transport, TransportError
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpointer import Checkpointer
@@ -92,6 +93,14 @@ def _t_within(angle: float, freedom: int) -> float:
     return math.sin(angle) * total
 
 
+@dataclass(frozen=True, slots=True)
+class Player:
+    """An evaluator that reaches `transport`, as nobody else does."""
+
+    transport: Transport
+    failure: Callable[[], str]  # why it has failed for good; empty as long as it may still play
+
+
 class TargetConfirmation:
     """The new episodes of one run."""
 
@@ -99,7 +108,7 @@ class TargetConfirmation:
         self,
         context: RunContext,
         publisher: SnapshotPublisher,
-        open_evaluators: Callable[[], AbstractContextManager[Evaluators]],
+        open_player: Callable[[], AbstractContextManager[Player]],
         beat: Callable[[], None],
     ) -> None:
         """Construct the confirmation.
@@ -107,10 +116,10 @@ class TargetConfirmation:
         Args:
           context: the run; its newest returns are forgotten when the target is not confirmed.
           publisher: has the program of the policy.
-          open_evaluators: starts an evaluator, and ends it. Raises TransportError or OSError.
+          open_player: starts a player, and ends it. Raises TransportError or OSError.
           beat: called again and again during the wait, to show that this process works.
         """
-        self._context, self._publisher, self._open_evaluators, self._beat = context, publisher, open_evaluators, beat
+        self._context, self._publisher, self._open_player, self._beat = context, publisher, open_player, beat
         self._not_before = -math.inf  # of the next attempt, on the monotonic clock
         self.result: dict[str, Any] | None = None  # of the new episodes that confirmed the target
 
@@ -156,13 +165,15 @@ class TargetConfirmation:
         return False
 
     def _played_with(self, learner: "Learner") -> tuple[EpisodePlan, EvaluationReport] | None:
-        """Return the episodes, or None if the run is stopped first. Raises as `play`."""
+        """Return the episodes, or None if the run is stopped first.
+
+        Raises EvaluatorError, and as `open_player`.
+        """
         context, program = self._context, self._publisher.offered
         spec, spaces = context.spec, context.fleet.spaces
         assert program is not None
         assert spaces is not None
         plan = EpisodePlan(
-            run=context.name,
             spec=spec,
             environment=spec.environment.as_evaluated(),
             spaces=spaces,
@@ -171,10 +182,14 @@ class TargetConfirmation:
             actions="sampled",
         )
         policy = OfferedPolicy(policy_version=learner.policy_version, program=program, weights=learner.weights())
-        reports = play(plan, [policy], self._open_evaluators, self._goes_on)
-        return None if reports is None else (plan, reports[0])
+        with self._open_player() as player:
 
-    def _goes_on(self) -> bool:
-        self._beat()
-        self._context.health.updated = time.monotonic()  # the learner works, although it does not train
-        return not self._context.stop.is_set()
+            def goes_on() -> bool:
+                if failure := player.failure():
+                    raise EvaluatorError(failure)
+                self._beat()
+                context.health.updated = time.monotonic()  # the learner works, although it does not train
+                return not context.stop.is_set()
+
+            reports = EvaluatorHost(context.name, player.transport).play(plan, [policy], goes_on)
+        return None if reports is None else (plan, reports[0])

@@ -1,4 +1,4 @@
-"""launch/final_evaluation.py: an evaluator whose process ends without a report."""
+"""launch/local_training.py: an evaluator whose process ends without a report."""
 
 import subprocess
 import sys
@@ -12,9 +12,9 @@ from saved_runs import CARTPOLE, save
 
 from daedalus.launch import supervision
 from daedalus.launch.child_output import ChildOutput, Streams
-from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
-from daedalus.launch.local_run import LocalRun
-from daedalus.learner.run.run_directory import write_json
+from daedalus.launch.local_run import LocalRun, RunFailedError
+from daedalus.launch.local_training import evaluate_run
+from daedalus.learner.run.run_directory import write_config, write_json
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 
 
@@ -37,10 +37,12 @@ def test_an_evaluator_that_ends_without_a_report_is_named_each_time(
     monkeypatch.setattr(supervision, "start", start)
     run = save(tmp_path / "run", CARTPOLE, 1)
     write_json(run / "summary.json", {})
-    local_run = LocalRun(directory=run, spec=read_policy(checkpoints(run)[0]).spec, started=0.0)
+    spec = read_policy(checkpoints(run)[0]).spec
+    write_config(run, spec)
+    local_run = LocalRun(directory=run, spec=spec, started=0.0)
     with (
         ChildOutput(tmp_path / "output.log", print, print) as output,
-        pytest.raises(EvaluationFailedError, match=reason),
+        pytest.raises(RunFailedError, match=reason),
     ):
         evaluate_run(local_run, threading.Event(), output)
     assert LINES == [f"evaluation-0 {how}; started again"] * 2

@@ -6,13 +6,12 @@ from pathlib import Path
 import pytest
 from saved_runs import CARTPOLE, save, score
 
-from daedalus.launch import final_evaluation
-from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
-from daedalus.launch.local_run import LocalRun
+from daedalus.actor.evaluation.episodes import EvaluationStoppedError
+from daedalus.launch.final_evaluation import FinalEpisodes
 from daedalus.learner.run.run_directory import write_json
-from daedalus.learner.serving.evaluator_host import EpisodePlan
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorHost
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
 def test_selection_plays_on_the_backend_of_the_training_episodes_that_nothing_else_plays(
@@ -23,13 +22,10 @@ def test_selection_plays_on_the_backend_of_the_training_episodes_that_nothing_el
     score(run, 300.0, 1)
     write_json(run / "summary.json", {})
     plans: list[EpisodePlan] = []
-    monkeypatch.setattr(final_evaluation, "play", lambda plan, *_: plans.append(plan))
-    spec = read_policy(checkpoints(run)[0]).spec
-    with (
-        ChildOutput(tmp_path / "output.log", lambda _: None, lambda _: None) as output,
-        pytest.raises(EvaluationFailedError),
-    ):
-        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event(), output)
+    monkeypatch.setattr(EvaluatorHost, "play", lambda _self, plan, *_: plans.append(plan))
+    spec, transport = read_policy(checkpoints(run)[0]).spec, MemoryTransport(MemoryNetwork())
+    with pytest.raises(EvaluationStoppedError):
+        FinalEpisodes(run, spec, transport, threading.Event()).evaluate()
     (plan,) = plans
     assert (plan.environment.backend, plan.episodes, plan.actions) == ("gymnasium", 20, "greedy")
     assert plan.seed not in (1, 1 + 2**32, 1 + 2**34)  # of the run, of the final evaluation, of the confirmation
