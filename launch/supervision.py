@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from daedalus.launch.child_output import ChildOutput, OpenStreams, Streams, inherited
-from daedalus.launch.process_lifecycle import STOPPED, interrupts_held
+from daedalus.launch.process_lifecycle import FAILED, STOPPED, interrupts_held
 
 _logger = logging.getLogger(__name__)
 
@@ -29,6 +29,7 @@ _CRASHES = {
 _MOST_FAILURES = 3  # of one process, in a row
 _SOON_SECONDS = 60.0  # a process that ran for longer before it ended starts a new count
 _MOST_RESTARTS = 1000  # of one process that is killed from outside
+_REPORT_SECONDS = 5.0  # from the end of an evaluator that failed to that of its host, even on a busy machine
 _LEAVING_SECONDS = 30.0  # between the end of the first process and the end of the others
 _GRACE_SECONDS = 4.0  # from SIGTERM to SIGKILL
 LEARNER_GRACE_SECONDS = 30.0  # the same for a learner: it waits for a slow disk, but not longer, and ends by itself
@@ -209,9 +210,14 @@ def evaluators(
     Yields a function that restarts those that died, and returns why one failed for good, or an empty string.
     """
     started: list[Supervised] = []
+    failed_at: dict[int, float] = {}  # by process id
 
     def failure() -> str:
+        now = time.monotonic()
         for each in started:
+            process = each.process
+            if process.poll() == FAILED and now < failed_at.setdefault(process.pid, now) + _REPORT_SECONDS:
+                continue  # it has told the host why, which then ends the episodes
             try:
                 restarted = each.check()
             except FailedError as error:
