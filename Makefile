@@ -64,7 +64,7 @@ mutants: .venv/ready-test
 	cd build/mutants && OMP_NUM_THREADS=1 nice ../../$(BIN)/mutmut run
 	cd build/mutants && ../../$(BIN)/mutmut export-cicd-stats && ../../$(BIN)/python tests/mutants.py
 
-# The documentation site, in build/site: open index.html there.
+# The documentation site, in build/site: open index.html there. It needs nothing of Daedalus.
 docs: .venv/ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
@@ -75,7 +75,7 @@ docs-reference: .venv/ready-train
 
 .venv/ready-docs: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(PIP) -e ".[docs]"
+	$(PIP) mkdocs-material
 	touch $@
 
 # torch first, with its exact version: on some indexes a range would select the CUDA build.

@@ -167,6 +167,7 @@ class Client:
             run=run,
             link=link,
             timeout=timeout,
+            searched_since=(began := time.monotonic()),
             waits_for_return=True,  # the caller's loop goes on meanwhile
             max_policy_age=guard.max_age if guard.enabled else None,
         )
@@ -186,7 +187,8 @@ class Client:
             self._service = ActorService(config, transport, self._stop, self._collector, report=self._report)
             self._collector.on_rollout = self._service.wake
             self._thread.start()
-            if not self._collector.policy_loaded.wait(timeout) and not self._collector.has_joined:
+            left = max(began + timeout - time.monotonic(), 0.0)
+            if not self._collector.policy_loaded.wait(left) and not self._collector.has_joined:
                 self._collector.policy_loaded.wait(_REFUSAL_SECONDS)  # the thread knows why it cannot join
             if not self._collector.policy_loaded.is_set():
                 raise ActorError(f"no policy came within {timeout:g} s: check that the learner is training")

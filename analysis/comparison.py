@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.analysis.recorded_run import ENVIRONMENT, record_command
-from daedalus.analysis.run_groups import Group, text
+from daedalus.analysis.recorded_run import record_command
+from daedalus.analysis.run_groups import Group, environment_of, text
 from daedalus.analysis.statistics import (
     Strata,
     improvement_interval,
@@ -92,9 +92,8 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
                 improvement=improvement([returns[index]], [returns[0]]) if index else None,
             )
         )
-    environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
     return Comparison(
-        environment=environment,
+        environment=environment_of(groups),
         evaluated=evaluated,
         threshold=threshold,
         results=results,
@@ -150,8 +149,19 @@ def improvement(strata: Strata, first: Strata) -> Estimate:
 _FEW = 5  # runs
 
 
-def as_text(comparison: Comparison) -> str:
-    """Return the table of a comparison, with what its columns mean."""
+def as_text(comparisons: Sequence[Comparison]) -> str:
+    """Return a table for each comparison, with what its columns mean."""
+    if len(comparisons) == 1:
+        return _table(comparisons[0])
+    return "\n\n\n".join(f"{_heading(comparison)}\n\n{_table(comparison)}" for comparison in comparisons)
+
+
+def _heading(comparison: Comparison) -> str:
+    runs = sum(result.runs for result in comparison.results)
+    return printable(f"{comparison.environment or 'unknown environment'}: {runs} {'run' if runs == 1 else 'runs'}")
+
+
+def _table(comparison: Comparison) -> str:
     head = header(comparison)
     rows = [cells(result, comparison) for result in comparison.results]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
@@ -231,6 +241,7 @@ def written(estimate: Estimate, form: Callable[[float], str]) -> str:
 
 _ESTIMATES = ("final_return", "env_steps", "minutes", "improvement")
 _HEADER = [
+    "environment",
     "group",
     "runs",
     "reached",
@@ -239,16 +250,18 @@ _HEADER = [
 ]
 
 
-def as_csv(comparison: Comparison) -> str:
-    """Return the table as CSV, one line for each group; blank: unknown; inf: not reached."""
+def as_csv(comparisons: Sequence[Comparison]) -> str:
+    """Return the tables as CSV, one line for each group; blank: unknown; inf: not reached."""
     stream = io.StringIO()
     writer = csv.writer(stream)
     writer.writerow(_HEADER)
-    for result in comparison.results:
-        numbers: list[float | None] = [result.reached, comparison.threshold]
-        for name in _ESTIMATES:
-            numbers += getattr(result, name) or (None, None, None)
-        writer.writerow([one_line(result.group), result.runs, *_blank(numbers)])
+    for comparison in comparisons:
+        for result in comparison.results:
+            numbers: list[float | None] = [result.reached, comparison.threshold]
+            for name in _ESTIMATES:
+                numbers += getattr(result, name) or (None, None, None)
+            names = one_line(comparison.environment), one_line(result.group)
+            writer.writerow([*names, result.runs, *_blank(numbers)])
     return stream.getvalue()
 
 

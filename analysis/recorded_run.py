@@ -9,24 +9,25 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from daedalus.learner.reporting.metrics_rows import lasting
+from daedalus.learner.reporting.metrics_rows import MAX_COLUMNS, lasting
+from daedalus.learner.reporting.thinning import bounded, line_bytes
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, EVENTS, METRICS, OUTPUT, SUMMARY, VERSIONS
-from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
+from daedalus.learner.run.run_files import RunDataError, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.protocol.spec import EnvironmentSpec
-from daedalus.protocol.texts import without_secrets
+from daedalus.protocol.texts import bounded_text, without_secrets
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
@@ -36,7 +37,8 @@ EVALUATION_RETURN = "evaluation_return_mean"  # during training
 _NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
 _SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
 _LARGEST = 1e300
-_MAX_METRICS_BYTES = 2 << 30  # a month of rows at the default log interval
+_MAX_METRICS_BYTES = 4 << 30  # a month of an earlier release, which did not merge old rows
+_LONGEST_LINE = MAX_COLUMNS << 8  # bytes
 _MAX_OUTPUT_BYTES = 16 << 10
 _VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
 
@@ -79,7 +81,9 @@ class RecordedRun:
         running = is_locked(self.directory)
         command = f"daedalus resume {shlex.quote(str(self.directory))}"
         remedy = "it is still running" if running else f"continue it with: {command}"
-        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
+        author = self.summary.get("stopped_by")
+        stopped = f", stopped by {bounded_text(author)}" if isinstance(author, str) and not running else ""
+        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps){stopped}: {remedy}"
 
     @property
     def evaluation_return(self) -> float | None:
@@ -188,7 +192,8 @@ def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
 def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
     """Return the metrics of a run, `metrics.csv`, as arrays [rows] by the names of the columns; NaN: no value.
 
-    docs/reference/metrics.md explains the columns. Rows that a resumed run has undone are left out.
+    docs/reference/metrics.md explains the columns. Rows that a resumed run has undone are left out, and old rows of a
+    run of many hours are merged.
 
     Raises RunDataError if the directory has no metrics.
     """
@@ -236,30 +241,49 @@ def record_command(directory: Path) -> str:
 
 
 def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the columns of metrics.csv, [rows]. The line that a running learner is writing is left out."""
+    """Return the columns of metrics.csv, [rows]. The line that a running learner is writing is left out.
+
+    A large file of an earlier release, which did not merge old rows, is read as if it had.
+    """
     path = directory / METRICS
     nothing = f"{directory} has no metrics yet: wait until the run has made its first updates"
-    content = read_file(path, _MAX_METRICS_BYTES)
-    if content is None:
-        raise RunDataError(nothing)
     try:
-        text = content.decode()
-        header, *rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
+        with open_regular(path) as file:
+            lines = csv.reader(_lines(path, file))
+            header = next(lines, [])
+            if not header:
+                raise RunDataError(nothing)
+            missing = [column for column in columns if column not in header]
+            if missing:
+                raise RunDataError(
+                    f"{path} has no column {missing[0]}: it is not the metrics of a run, or those of an old release"
+                )
+            rows = ((line_bytes(row), _numbers(path, lines.line_num, row, len(header))) for row in lines)
+            values = bounded(header, rows)
+    except FileNotFoundError:
+        raise RunDataError(nothing) from None
+    except OSError as error:
+        raise RunDataError(f"{path}: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise RunDataError(f"{path} is damaged: {error}") from None
-    except ValueError:  # no line at all
-        raise RunDataError(nothing) from None
-    missing = [column for column in columns if column not in header]
-    if missing:
-        raise RunDataError(
-            f"{path} has no column {missing[0]}: it is not the metrics of a run, or those of an old release"
-        )
-    if not rows:
+    if not len(values):
         raise RunDataError(nothing)
-    values = [_numbers(path, number, row, len(header)) for number, row in enumerate(rows, start=2)]
-    found = dict(zip(header, np.array(values).T, strict=True))
+    found = dict(zip(header, values.T, strict=True))
     kept = lasting(*(found[name] for name in (ENV_STEPS, SECONDS) if name in found))
     return {name: column[kept] for name, column in found.items()}
+
+
+def _lines(path: Path, file: BinaryIO) -> Iterator[str]:
+    """Yield the complete lines that a file has now. Raises RunDataError, UnicodeDecodeError."""
+    left = os.fstat(file.fileno()).st_size
+    if left > _MAX_METRICS_BYTES:
+        raise RunDataError(f"{path} is larger than {_MAX_METRICS_BYTES >> 20} MiB, the limit for such a file of a run")
+    while left > 0 and (line := file.readline(_LONGEST_LINE)):
+        left -= len(line)
+        if line.endswith(b"\n"):
+            yield line.decode()
+        elif len(line) == _LONGEST_LINE:
+            raise RunDataError(f"{path} is damaged: it has a line of more than {_LONGEST_LINE >> 10} KiB")
 
 
 def _numbers(path: Path, line: int, row: Sequence[str], cells: int) -> list[float]:

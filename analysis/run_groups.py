@@ -30,18 +30,25 @@ class Group(Generic[Run]):
     unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in the name
 
 
-def check_comparable(runs: Sequence[RecordedRun]) -> None:
-    """Check that runs play the same environment. Raises RunDataError."""
-    first: dict[str, Path] = {}
-    for run in runs:
-        if ENVIRONMENT in run.settings:
-            first.setdefault(run.settings[ENVIRONMENT], run.directory)
-    if len(first) > 1:
-        played = " and ".join(f"{environment} ({directory})" for environment, directory in list(first.items())[:2])
-        raise RunDataError(
-            f"the runs play different environments, whose returns cannot be compared: {played}; "
-            "name the runs of one environment"
-        )
+def environment_of(groups: Sequence[Group]) -> str:
+    """Return the environment that the runs of some groups play; empty if it is unknown."""
+    runs = (run for group in groups for run in group.runs)
+    return next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
+
+
+def _by_environment(parts: Sequence[Sequence[Run]]) -> list[list[list[Run]]]:
+    """Return parts with the runs of one environment each, by environment: returns of others cannot be compared.
+
+    A run whose environment is unknown is with the others if they play one only.
+    """
+    played = {run.settings.get(ENVIRONMENT) for part in parts for run in part}
+    if len(played - {None}) < 2:
+        return [[list(part) for part in parts]]
+    ordered = sorted(played, key=lambda environment: (environment is None, environment or ""))
+    return [
+        [[run for run in part if run.settings.get(ENVIRONMENT) == environment] for part in parts]
+        for environment in ordered
+    ]
 
 
 def by_settings(runs: Sequence[Run], keys: Sequence[str] = ()) -> list[Group[Run]]:
@@ -172,8 +179,8 @@ def select(
     columns: Sequence[str] = (),
     keys: Sequence[str] = (),
     read: Callable[[Path, Sequence[str]], Run] = read_run,
-) -> tuple[list[Group[Run]], list[str]]:
-    """Return the groups of the runs that paths name, and one line for each run that is left out.
+) -> tuple[list[list[Group[Run]]], list[str]]:
+    """Return the groups of the runs that paths name, of each environment, and one line for what is left out.
 
     Args:
       parts: paths of run directories or of folders of them. One part is grouped by settings; several parts are groups.
@@ -182,7 +189,7 @@ def select(
       keys: settings that name the groups, if there is one part (default: those that differ).
       read: reads a run directory: `read_run`, or `read_record` for all that it records.
 
-    Raises RunDataError if a path is no run directory, no run is left, or the runs play different environments.
+    Raises RunDataError if a path is no run directory, or no run of a part is left.
     """
     problems: list[str] = []
 
@@ -199,7 +206,14 @@ def select(
 
     runs = [[run for run in map(usable, find_runs(part)) if run is not None] for part in parts]
     if not all(runs):
-        raise RunDataError("; ".join(problems[:1]))
-    check_comparable([run for part in runs for run in part])
-    groups = by_settings(runs[0], keys) if len(runs) == 1 else by_user(runs)
-    return groups, [f"left out: {problem}" for problem in problems]
+        more = f" ({len(problems) - 1} more runs cannot be used either)" if len(problems) > 1 else ""
+        raise RunDataError(f"{problems[0]}{more}")
+    found: list[list[Group[Run]]] = []
+    for played in _by_environment(runs):
+        found.append(by_settings(played[0], keys) if len(played) == 1 else by_user([part for part in played if part]))
+        problems += [
+            f"group {number} has no run of {environment_of(found[-1]) or 'an unknown environment'}"
+            for number, part in enumerate(played, start=1)
+            if not part
+        ]
+    return found, [f"left out: {problem}" for problem in problems]

@@ -18,7 +18,7 @@ from daedalus.analysis.charts import SERIES_COLOURS, histogram, line_chart
 from daedalus.analysis.comparison import Comparison, cells, compare_groups, header, notes
 from daedalus.analysis.learning_curves import LARGEST, series_of
 from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite, record_command
-from daedalus.analysis.run_groups import Group, text
+from daedalus.analysis.run_groups import Group, environment_of, text
 from daedalus.analysis.run_results import (
     EpisodeStatistics,
     episode_statistics,
@@ -32,6 +32,7 @@ from daedalus.analysis.run_results import (
 )
 from daedalus.learner.reporting.metrics_rows import ENV, USER
 from daedalus.learner.run.run_directory import CONFIG
+from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
 from daedalus.protocol.texts import printable
 
 _STYLE = Path(__file__).with_name("report_style.css")
@@ -86,6 +87,7 @@ def run_page(group: Group[RunRecord], by: str) -> str:
         _curves([group], by),
         evaluation_section(record),
         video_section(record),
+        orders_section(record),
         failure_section(record),
         settings_section(record),
         versions_section(record),
@@ -94,7 +96,7 @@ def run_page(group: Group[RunRecord], by: str) -> str:
 
 
 def comparison_page(
-    groups: Sequence[Group[RunRecord]],
+    environments: Sequence[Sequence[Group[RunRecord]]],
     by: str,
     *,
     threshold: float | None,
@@ -103,26 +105,40 @@ def comparison_page(
     """Return the report of several runs.
 
     Args:
-      groups: the runs, one curve for each group.
+      environments: the runs of each environment, one curve for each group.
       by: horizontal axis of the curves, "env_steps" or "minutes".
       threshold: mean return to reach, for the table (default: the target return of the runs).
       left_out: one line for each run that could not be read.
     """
+    groups = [group for groups in environments for group in groups]
     runs = [run for group in groups for run in group.runs]
-    comparison = comparison_of(groups, threshold)
-    environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
-    title = f"{len(runs)} runs of {environment}" if environment else f"{len(runs)} runs"
+    several = len(environments) > 1
+    played = f"{len(environments)} environments" if several else environment_of(groups)
+    title = f"{len(runs)} runs of {played}" if played else f"{len(runs)} runs"
     unfinished = [run.unfinished for run in runs if run.unfinished]
+    sections = [_environment_sections(each, by, threshold, named=several) for each in environments]
     return _document(
         title,
         _header(title, [f"{len(groups)} groups" if len(groups) > 1 else "1 group"], None),
         [element("p", line, class_="note") for line in [*left_out, *unfinished]],
-        comparison_section(comparison),
-        _curves(groups, by),
-        runs_section(groups),
-        differences_section(groups),
+        sections,
         versions_of_runs_section(groups),
     )
+
+
+def _environment_sections(
+    groups: Sequence[Group[RunRecord]], by: str, threshold: float | None, *, named: bool
+) -> list[ET.Element | None]:
+    """Return what a report of several runs shows of one environment, under its name if there are several."""
+    environment = environment_of(groups) or "unknown environment"
+    heading = element("h2", environment, class_="environment") if named else None
+    return [
+        heading,
+        comparison_section(comparison_of(groups, threshold)),
+        _curves(groups, by, of=environment if named else ""),
+        runs_section(groups),
+        differences_section(groups),
+    ]
 
 
 def section(title: str, *content: Child) -> ET.Element:
@@ -246,6 +262,18 @@ def video_section(record: RunRecord) -> ET.Element | None:
     if video.media_type == "image/gif":
         return section("Video", element("img", src=source, alt=name, class_="video"))
     return section("Video", element("video", src=source, controls=True, loop=True, muted=True, aria_label=name))
+
+
+def orders_section(record: RunRecord) -> ET.Element | None:
+    """Return the orders of operators and who gave them; None without any."""
+    given = [each for each in record.events if each.text.startswith((ORDERED_BY, DRAINED_BY, STOPPED_BY))]
+    if not given:
+        return None
+    rows = [(each.time, each.actor or "the run", each.kind, each.text) for each in given[-_MOST_EVENTS:]]
+    more = len(given) - len(rows)
+    left_out = element("p", f"{more:,} earlier ones are in events.jsonl.", class_="muted") if more > 0 else None
+    listed = table(("at (UTC)", "about", "event", "order"), rows, label="orders of operators")
+    return section("Orders of operators", listed, left_out)
 
 
 def failure_section(record: RunRecord) -> ET.Element:
@@ -392,8 +420,8 @@ def versions_of_runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element |
     return section("Versions", table(head, rows, label="versions"))
 
 
-def _curves(groups: Sequence[Group], by: str) -> ET.Element:
-    """Return a chart of each column of the metrics that has values."""
+def _curves(groups: Sequence[Group], by: str, of: str = "") -> ET.Element:
+    """Return a chart of each column of the metrics that has values; `of` tells charts of the page apart."""
     several = len(groups) > 1 or len(groups[0].runs) > 1
     band = "The band is one standard deviation of the newest episodes, circles are evaluations."
     if several:
@@ -407,7 +435,8 @@ def _curves(groups: Sequence[Group], by: str) -> ET.Element:
         found = [(series, index) for index, group in enumerate(groups) if (series := series_of(group, column, by))]
         if any(column == RETURN or series.y.any() for series, _ in found):  # all 0: nothing of the kind happened
             lines, colours = zip(*found, strict=True)
-            charts.append(_figure(title, line_chart(title, lines, unit=by, colours=colours)))
+            name = f"{of}: {title}" if of else title
+            charts.append(_figure(title, line_chart(name, lines, unit=by, colours=colours)))
     return section(
         "Learning curves",
         element("p", band, class_="muted"),

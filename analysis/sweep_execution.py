@@ -337,13 +337,13 @@ def report(folder: Path, planned: Sequence[PlannedRun], end: SweepEnd, keys: Seq
     directories = [run.directory for run in planned if run in end.done]
     if not directories:
         return _failures(end)
-    groups, problems = select([directories], finished=True, columns=[SECONDS, *COLUMNS], keys=keys)
+    (groups,), problems = select([directories], finished=True, columns=[SECONDS, *COLUMNS], keys=keys)
     if ranked:
         groups.sort(key=_final_return, reverse=True)
-    comparison = compare_groups(groups)
+    comparisons = [compare_groups(groups)]
     with replacing(folder / TABLE) as beside:
-        beside.write_bytes(as_csv(comparison).encode())  # with the ends of lines that it has
-    lines = ["", as_text(comparison), *problems]
+        beside.write_bytes(as_csv(comparisons).encode())  # with the ends of lines that it has
+    lines = ["", as_text(comparisons), *problems]
     try:
         draw_curves(groups, folder / CURVES, ENV_STEPS)
         written = f"{folder}: {TABLE}, {RUNS}, {CURVES} and the run directories"

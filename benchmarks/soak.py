@@ -42,9 +42,9 @@ def _soak(here: Scene, duration: float) -> list[tuple[str, ...]]:
     here.wait_for_training()
     lasting = {
         "launcher": launcher.process.pid,
-        "learner": here.process("--prepared", here.address),
-        "actor-0": here.process("--name", "actor-0", here.address),
-        "actor-1": here.process("--name", "actor-1", here.address),
+        "learner": here.process("--prepared"),
+        "actor-0": here.process("--name", "actor-0"),
+        "actor-1": here.process("--name", "actor-1"),
     }
     samples: dict[str, list[tuple[float, float, int, int]]] = {name: [] for name in lasting}
     began = time.monotonic()
@@ -53,7 +53,7 @@ def _soak(here: Scene, duration: float) -> list[tuple[str, ...]]:
         for name, pid in lasting.items():
             samples[name].append((now - began, resident_mib(pid), *_threads_and_files(pid)))
         if now > kill_at:
-            os.kill(here.process("--name", f"actor-{choose.choice((2, 3))}", here.address), signal.SIGKILL)
+            os.kill(here.process("--name", f"actor-{choose.choice((2, 3))}"), signal.SIGKILL)
             kill_at, kills = now + _KILL_SECONDS, kills + 1
         if now > tell_at:
             memory = ", ".join(f"{name} {each[-1][1]:.1f}" for name, each in samples.items())

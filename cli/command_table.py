@@ -23,6 +23,8 @@ on several machines, one process at a time:
   actor      play environments for a learner; needs only its address
   router     connect learner and actors at a fixed address
   status     show the state of a learner and its actors
+  stop       save a checkpoint of a run and end its learner
+  checkpoint save a checkpoint of a run now
   drain      ask actors to leave after their current rollout
   gateway    show a run on a web page, and connect actors in any language
   exporter   export the status as Prometheus metrics
@@ -74,7 +76,9 @@ COMMANDS = {
     "actor": Command("commands.actor:parser"),
     "router": Command("commands.router:parser", "commands.router:router"),
     "status": Command("commands.status:parser", "commands.status:status"),
-    "drain": Command("commands.drain:parser", "commands.drain:drain"),
+    "stop": Command("commands.orders:stop_parser", "commands.orders:stop"),
+    "checkpoint": Command("commands.orders:checkpoint_parser", "commands.orders:checkpoint"),
+    "drain": Command("commands.orders:drain_parser", "commands.orders:drain"),
     "gateway": Command("commands.gateway:parser"),
     "exporter": Command("commands.exporter:parser", "commands.exporter:exporter"),
     "certs": Command("commands.certs:parser", "commands.certs:certs"),

@@ -14,7 +14,7 @@ from rich.text import Text
 from daedalus.cli.run_watcher import WatchedRun
 from daedalus.learner.reporting.progress import duration
 from daedalus.protocol.messages import ActorStatus
-from daedalus.protocol.texts import one_line, short_number
+from daedalus.protocol.texts import one_line, policy_lag, short_number
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 
@@ -73,7 +73,7 @@ def _run(run: WatchedRun, width: int, lines: int, ascii_only: bool) -> list[Rend
     more = status.fleet_size - len(shown)
     parts: list[RenderableType] = [*_head(run, width, ascii_only), *problems]
     if shown:
-        parts.append(_actors(shown, width))
+        parts.append(_actors(shown, width, status.updates_per_batch))
     if more > 0:
         parts.append(_line([f"... and {more:,} more" if shown else f"{more:,} actors"], width, "dim"))
     return parts
@@ -104,7 +104,7 @@ def _head(run: WatchedRun, width: int, ascii_only: bool) -> list[RenderableType]
             [
                 f"updates {status.updates:,}",
                 f"{status.updates_per_second:,.0f}/s",
-                f"lag {status.policy_lag_mean:.1f}",
+                f"lag {policy_lag(status.policy_lag_mean, status.updates_per_batch)}",
                 *([f"{status.updates_skipped:,} skipped"] if status.updates_skipped else []),
                 f"rollouts {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
             ],
@@ -113,27 +113,27 @@ def _head(run: WatchedRun, width: int, ascii_only: bool) -> list[RenderableType]
     ]
 
 
-def _actors(actors: Sequence[ActorStatus], width: int) -> Table:
+def _actors(actors: Sequence[ActorStatus], width: int, updates_per_batch: int) -> Table:
     shown = [name for name, needed in _COLUMNS if width >= needed]
     table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="dim")
     for name in shown:
         right = name not in ("actor", "state", "host")
         table.add_column(name, justify="right" if right else "left", no_wrap=True, overflow="ellipsis")
     for actor in actors:
-        cells = _cells(actor)
+        cells = _cells(actor, updates_per_batch)
         style = "" if cells["state"].plain == "alive" else "dim" if cells["state"].plain == "gone" else "yellow"
         table.add_row(*(cells[name] for name in shown), style=style)
     return table
 
 
-def _cells(actor: ActorStatus) -> dict[str, Text]:
+def _cells(actor: ActorStatus, updates_per_batch: int) -> dict[str, Text]:
     answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
     return {
         "actor": Text(one_line(actor.actor)),
         "state": Text("quarantined" if actor.quarantined else "alive" if actor.alive else "gone"),
         "env_steps": Text(f"{actor.env_steps:,}"),
         "/s": Text(f"{actor.env_steps_per_second:,.0f}"),
-        "lag": Text(f"{actor.policy_lag}"),
+        "lag": Text(policy_lag(actor.policy_lag, updates_per_batch).partition(" (")[0]),
         "busy": Text(f"{actor.busy_answers / max(answers, 1):.0%}"),
         "host": Text(one_line(actor.host)),
     }

@@ -54,7 +54,7 @@ class Screen:
         """Show a line in place of a frame."""
         from rich.text import Text
 
-        self._update(lambda *_: Text(printable(text), no_wrap=True, overflow="ellipsis"))
+        self._update(lambda *_: Text(printable(text)))
 
     def end(self, run: "WatchedRun | None" = None) -> None:
         """End the display. Its last frame stays, or a short one of `run`."""

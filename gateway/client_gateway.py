@@ -285,7 +285,7 @@ class Gateway:
         if verdict == "quarantined":
             seat.on_end(ClientError("refused", f"the learner quarantined this client: {reason}"))
         elif verdict == "drained":
-            seat.on_end(ClientError("refused", "an operator drained this client: it leaves the run"))
+            seat.on_end(ClientError("refused", f"{reason or 'drained by an operator'}: this client leaves the run"))
         elif verdict == "finished":
             seat.on_end("the run is over")
         elif verdict == "fenced":

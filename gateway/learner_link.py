@@ -56,6 +56,8 @@ class LinkEvents(Protocol):
 class LinkSession(PolicySession):
     """What the gateway itself says to learners: it follows their policies, and is no actor."""
 
+    is_actor = False
+
     def __init__(self, config: ActorConfig, origin: Origin) -> None:
         super().__init__(config, origin)
         self._mentioned_version = -1  # of this learner epoch, by an acknowledgement

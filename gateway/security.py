@@ -66,11 +66,12 @@ class Tokens:
         self._read()
         return self._check_among(self._tokens, token, "the page needs a token: of a client, or of an operator")
 
-    def check_operator(self, token: str) -> None:
-        """Raise ClientError unless the token is that of an operator."""
+    def check_operator(self, token: str) -> str:
+        """Return the owner of an operator's token, for a person. Raises ClientError if it is no such token."""
         self._read()
         operators = {name: entry for name, entry in self._tokens.items() if name.startswith(OPERATOR)}
-        self._check_among(operators, token, "this needs an operator's token (daedalus certs issue operator NAME)")
+        refusal = "this needs an operator's token (daedalus certs issue operator NAME)"
+        return f"operator {self._check_among(operators, token, refusal).removeprefix(OPERATOR)}"
 
     def _check_among(self, tokens: dict[str, tuple[str, float]], token: str, refusal: str) -> str:
         given = digest(token)
@@ -131,10 +132,11 @@ class OperatorToken:
             raise ValueError(f"{path} has no token of {_MIN_TOKEN} to {_MAX_TOKEN} characters: delete the file")
         self._digest = digest(token)
 
-    def check_operator(self, token: str) -> None:
-        """Raise ClientError unless this is the token."""
+    def check_operator(self, token: str) -> str:
+        """Return the owner of the token, for a person. Raises ClientError if this is not the token."""
         if not hmac.compare_digest(self._digest, digest(token)):
             raise ClientError("refused", "this is not the operator's token: it is in the file of --operator-token")
+        return "the operator"
 
 
 MESSAGES_PER_SECOND, _BURST = 1000.0, 2000.0
@@ -210,12 +212,12 @@ class Guard:
         """Whether there is any token with which a page may give orders."""
         return self.tokens is not None or self.operator is not None
 
-    def check_operator(self, token: str) -> None:
-        """Raise ClientError unless a page may give orders with this token."""
+    def check_operator(self, token: str) -> str:
+        """Return the owner of a token, for a person. Raises ClientError unless a page may give orders with it."""
         tokens = self.tokens or self.operator
         if tokens is None:
             raise ClientError("refused", "this gateway takes no orders: start it with --operator-token FILE")
-        tokens.check_operator(token)
+        return tokens.check_operator(token)
 
 
 def guard(

@@ -27,6 +27,7 @@ from daedalus.protocol.messages import Order
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.operator_orders import Operator
 from daedalus.transport.retries import Retries
 
 _logger = logging.getLogger(__name__)
@@ -154,18 +155,19 @@ class GatewayService:
                     return None
 
     def _begin_to_watch(self, transport: Transport, gateway: Gateway) -> None:
-        source = LearnerSource(transport, self._settings.run, lambda: gateway.run.name)
+        operator = Operator.here(self._settings.operator)
+        source = LearnerSource(transport, self._settings.run, lambda: gateway.run.name, operator)
 
         def show(seen: Observation) -> None:
             if not self._stop.is_set():
                 self._loop.call_soon_threadsafe(self._data.show, seen)
 
-        def give(order: Order) -> tuple[bool, str]:
+        def give(order: Order, token: str) -> tuple[bool, str]:
             status = self._data.seen.status
             if status is None:
                 return False, "no learner has answered yet"
             try:
-                return source.order(status, order)
+                return source.order(status, order, token)
             except (TransportError, ProtocolError) as error:
                 return False, str(error)
 

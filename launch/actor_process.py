@@ -8,6 +8,7 @@ causes that somebody else can remove, so it reports them and tries again.
 import logging
 import secrets
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from daedalus.policy.user_code import frames_of, is_of_user
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Welcome
+from daedalus.transport.addresses import socket_path
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect
 from daedalus.transport.interface import TransportError, UnreachableError
@@ -72,7 +74,8 @@ class ActorOptions:
             environments=self.environments,
             runtime=self.runtime,
             modules=UserModules(self.allowed_modules, "the learner"),
-            link=self.link,
+            # Between processes of one machine, only a busy processor is slow.
+            link="lan" if self.link == "auto" and all(map(socket_path, self.connect)) else self.link,
             timeout=self.timeout,
             any_run=self.any_run,
         )
@@ -148,6 +151,7 @@ def _serve_run(
     on_join: Callable[[Welcome], None],
 ) -> bool:
     """Take part in one run; return whether the run finished. Raises what `main` reports."""
+    config = replace(config, searched_since=time.monotonic())
     transport = connect_with_retry(options.connect, stop, config.timeout, credentials)
     if transport is None:
         return False

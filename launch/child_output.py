@@ -28,6 +28,7 @@ _SHOWN_AT_ONCE = 40  # lines; afterwards one line in so many seconds
 _SECONDS_A_LINE = 5.0
 _KEPT_LINES = 40
 _SHOWN_AT_END = 5  # error lines of a process that were not shown before: a traceback ends with what matters
+_TRACEBACK = "Traceback (most recent call last)"
 _REPETITION = 2  # a line that equals one of so many before it is not shown: a warning that every environment repeats
 _CLOSE_SECONDS = 5.0
 _WAITING_WRITES = 256  # for the log; each has at most 64 KiB
@@ -141,6 +142,7 @@ class ChildOutput:
         self.withheld = 0  # lines that should have been shown, and were not
         self._unshown: dict[str, deque[str]] = {}  # newest lines of standard error that were not shown, by process
         self._newest: dict[tuple[str, str], deque[str]] = {}  # newest lines by process and stream
+        self._traced: dict[str, bool] = {}  # processes with a traceback, and whether it goes on
         self._readers: dict[str, list[_Reader]] = {}
 
     @contextmanager
@@ -175,11 +177,15 @@ class ChildOutput:
             return list(self._unshown.get(name, ()))
 
     def last_error(self, name: str) -> str:
-        """Return the last line of standard error of a process, or an empty string. Call it after the process's end."""
+        """Return the last line of standard error of a process, or an empty string. Call it after the process's end.
+
+        It names the file with the tracebacks of the process, if there are any.
+        """
         self._wait(self._readers.get(name, []))
         with self._lock:
             lines = [line.strip() for line in self._newest.get((name, "stderr"), ())]
-        return next(filter(None, reversed(lines)), "")
+            last, traced = next(filter(None, reversed(lines)), ""), name in self._traced
+        return f"{last}; the traceback is in {self.path}" if last and traced else last
 
     def close(self) -> None:
         """Read what is left of the output, and say how many lines were not shown. Call it after the processes' end."""
@@ -214,6 +220,8 @@ class ChildOutput:
     def _take(self, name: str, stream: str, lines: list[str], shown: bool) -> None:
         with self._lock:
             self._log.write([f"[{name}] {line}\n".encode() for line in lines])
+            if stream == "stderr":
+                lines = self._without_tracebacks(name, lines)
             lines = self._without_repetitions(name, stream, lines)
             count = self._limits[stream].take(len(lines), time.monotonic()) if shown else 0
             self._show(stream, lines[:count])
@@ -230,6 +238,22 @@ class ChildOutput:
             lines = list(self._unshown.pop(name, ()))[-_SHOWN_AT_END:]
             self.withheld -= len(lines)
             self._show("stderr", lines)
+
+    def _without_tracebacks(self, name: str, lines: Sequence[str]) -> list[str]:
+        """Leave out what stands above the last line of a traceback; say once for each process where it is."""
+        kept = []
+        for line in lines:
+            begins = line.startswith(_TRACEBACK)
+            if begins and name not in self._traced:
+                kept.append(f"the traceback of {name} is in {self.path}")
+            if begins or (self._traced.get(name) and line[:1] in ("", " ")):
+                self._traced[name] = True
+                self.withheld += 1
+                continue
+            if name in self._traced:
+                self._traced[name] = False
+            kept.append(line)
+        return kept
 
     def _without_repetitions(self, name: str, stream: str, lines: Sequence[str]) -> list[str]:
         newest = self._newest.setdefault((name, stream), deque(maxlen=_REPETITION))

@@ -17,6 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daedalus.launch.process_lifecycle import interrupts_held
+from daedalus.policy.user_code import names_place
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -208,19 +209,50 @@ def checked_spaces(spec: RunSpec, *, fork: bool = False) -> Spaces | None:
     report = _checked(spec, fork)
     if problem := report.text_problem(spec):
         raise EnvironmentProblemError(problem)
+    _log_advice(report, spec)
     return report.spaces
 
 
-def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | None, dict[str, Any]]:
+def checked_defaults(
+    spec_with: Callable[[dict[str, Any] | None], RunSpec], *, fork: bool = False
+) -> tuple[Spaces | None, dict[str, Any]]:
     """Check an environment without settings: return its spaces and the default settings for it. See checked_spaces.
 
-    A text that never changes is left out, and logged.
+    A text that never changes is left out, and logged, as is why slow environments get processes of their own.
+
+    Args:
+      spec_with: returns the specification with default settings; None: without knowledge of the spaces.
+      fork: see quick_check.
     """
-    return _defaults(_checked(spec, fork, for_settings=True), spec)
+    spec = spec_with(None)
+    report = _checked(spec, fork, for_settings=True)
+    spaces, defaults = _defaults(report, spec)
+    defaults, reason = with_measured_processes(spec_with, defaults, report)
+    if reason:
+        _logger.info("%s", reason)
+    _log_advice(report, spec_with(defaults))
+    return spaces, defaults
+
+
+def with_measured_processes(
+    spec_with: Callable[[dict[str, Any] | None], RunSpec], defaults: dict[str, Any], report: "EnvironmentReport"
+) -> tuple[dict[str, Any], str]:
+    """Give slow environments processes of their own, unless the user has chosen.
+
+    Return the default settings, and the reason, or an empty string. With processes, nothing changes but the speed. See
+    checked_defaults for the arguments.
+    """
+    from daedalus.actor.checking.check_report import slow_steps
+
+    slow = slow_steps(report, spec_with(defaults), os.cpu_count() or 1)
+    if not slow:
+        return defaults, ""
+    changed = {**defaults, "environment": {**defaults.get("environment", {}), "processes": True}}
+    return changed, f"{slow}; each gets a process of its own instead (environment.processes=true)"
 
 
 def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "EnvironmentReport":
-    from daedalus.actor.checking.check_report import EnvironmentReport, advice, slow_start
+    from daedalus.actor.checking.check_report import EnvironmentReport, slow_start
 
     try:
         modules = UserModules(frozenset(modules_of(spec.user_modules)))
@@ -230,12 +262,20 @@ def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "Envir
         _logger.warning("the check of the environment was %s: the run starts without it%s", error, hint)
         return EnvironmentReport()
     if report.problems:
-        raise EnvironmentProblemError(with_preset(report.problems[0], spec))
+        problem = with_preset(report.problems[0], spec)
+        # Nothing is recorded yet: the check has no terminal, and the run no folder.
+        hint = "; `daedalus check` with the same options shows the traceback" if names_place(problem) else ""
+        raise EnvironmentProblemError(f"{problem}{hint}")
     for warning in report.warnings:
         _logger.warning("%s", warning)
+    return report
+
+
+def _log_advice(report: "EnvironmentReport", spec: RunSpec) -> None:
+    from daedalus.actor.checking.check_report import advice
+
     for text in advice(report, spec, os.cpu_count() or 1):
         _logger.info("%s", text)
-    return report
 
 
 def with_preset(problem: str, spec: RunSpec) -> str:

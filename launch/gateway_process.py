@@ -19,7 +19,8 @@ from daedalus.gateway.security import OperatorToken
 from daedalus.gateway.watching.page_data import OtherRun
 from daedalus.launch.logs import print_error, say
 from daedalus.launch.process_lifecycle import BAD_USAGE
-from daedalus.learner.reporting.metrics_rows import MetricsHistory, read_rows
+from daedalus.learner.reporting.metrics_rows import read_rows
+from daedalus.learner.reporting.thinning import MetricsHistory
 from daedalus.learner.run.run_directory import METRICS
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_modules import allow_words

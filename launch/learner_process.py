@@ -218,7 +218,8 @@ class LearnerProcess:
         self._credentials = options.network.credentials()
         self._run = choose_run(options)
         display = Progress if options.shows_progress else SilentProgress
-        self._progress = display(sys.stdout, self._run.spec.training.env_steps)
+        training = self._run.spec.training
+        self._progress = display(sys.stdout, training.env_steps, training.updates_per_batch)
         self._context = {"run": run_directory.run_name(self._run.directory)}  # fields of the log
 
     def run(self) -> int:
@@ -411,6 +412,6 @@ def _status(outcome: Outcome, spec: RunSpec, stopped: int, unsaved: int) -> int:
     if not outcome.saved:
         return unsaved
     if not outcome.finished:
-        return ORDERED if outcome.ordered and stopped else stopped
+        return ORDERED if outcome.stopped_by and stopped else stopped
     wanted = spec.training.target_return is not None and spec.training.stop_when_solved
     return NOT_REACHED if wanted and not outcome.solved else REACHED

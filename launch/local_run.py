@@ -52,7 +52,7 @@ class UnsavedError(RunFailedError):
 
 
 class RunStoppedError(Exception):
-    """Error of a run that was stopped before its end."""
+    """Error of a run that was stopped before its end; the message says which operator stopped it, if one did."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,9 +37,11 @@ from daedalus.launch.supervision import (
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.run_directory import OPERATOR_TOKEN
+from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import EventFile
 from daedalus.policy.saving.saved_policy import candidates
 from daedalus.policy.user_modules import allow_settings
+from daedalus.protocol.texts import one_line
 from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)
@@ -191,8 +193,10 @@ def run_locally(
         else:
             trackers.start()
             status = run.trained
-        if stopping.is_set() or status == ORDERED:
+        if stopping.is_set():
             raise RunStoppedError
+        if status == ORDERED:
+            raise RunStoppedError(_stopped_by(run))
         if status == UNSAVED:
             raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
         if status not in FINISHED:
@@ -211,6 +215,12 @@ def run_locally(
         if run.watch:
             with suppress(OSError):
                 (run.directory / run_directory.OPERATOR_TOKEN).unlink()
+
+
+def _stopped_by(run: LocalRun) -> str:
+    with suppress(SettingsError):  # missing or damaged
+        return one_line(str(run_directory.read_json(run.directory / run_directory.SUMMARY).get("stopped_by") or ""))
+    return ""
 
 
 def _remedy(run: LocalRun) -> str:

@@ -147,7 +147,7 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
     if choice.env is None:
         spaces = checked_spaces(spec, fork=fork)
     else:
-        spaces, defaults = checked_defaults(spec, fork=fork)
+        spaces, defaults = checked_defaults(choice.spec, fork=fork)
         chosen = choice.spec(defaults)
         spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
     if problem := unmeasured_target(spec):

@@ -19,7 +19,7 @@ from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.resuming import NO_WEIGHTS, Beginning
 from daedalus.learner.run.settings import check_rollout_length, unmeasured_target
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.events import EventFile
+from daedalus.learner.serving.events import STOPPED_BY, EventFile
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.target_confirmation import Player, TargetConfirmation
 from daedalus.policy.user_modules import shown_path
@@ -45,7 +45,7 @@ class Outcome:
     finished: bool  # solved or out of budget; False if the run was stopped before
     saved: bool  # whether the last checkpoint was saved, or there was nothing to save
     seconds_to_target: float | None  # seconds until the target return was reached; None if it was not
-    ordered: bool = False  # whether an operator stopped the run
+    stopped_by: str = ""  # the operator who stopped the run; empty if none did
     superseded_by: int | None = None  # epoch of a newer learner of this run, for which this one stepped down
 
 
@@ -117,17 +117,20 @@ class LearnerService:
                 return self._stopped_without_actors()
             return self._learn(learner, checkpointer, loop)
         finally:
-            self._server.close(_STOPPED)  # unless it is closed
+            self._server.close(self._why_stopped)  # unless it is closed
             self._heartbeat.clear()
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
+        self._server.close(self._why_stopped)
+        EventFile(self._context.directory).add(self._context.events.take_new())
+        self._server.orders.take_checkpoint()(True, "stopped before the first actor joined: there is nothing to save")
         return Outcome(
             solved=False,
             finished=False,
             saved=True,
             seconds_to_target=None,
-            ordered=self._server.orders.stopped,
+            stopped_by=self._server.orders.stopped_by,
             superseded_by=self._server.orders.superseded_by,
         )
 
@@ -160,16 +163,18 @@ class LearnerService:
         finally:
             ended = ended or time.monotonic()
             try:
-                server.close(_FINISHED if finished else _STOPPED, finished=finished)
+                server.close(_FINISHED if finished else self._why_stopped, finished=finished)
                 saving = checkpointer.begin(last=True)  # it is written while the last metrics are
                 reporter.record(learner, ended, last=True)
                 reporter.close()
             finally:
                 saving = saving or checkpointer.begin(last=True)
                 saved = checkpointer.wait(saving, self._heartbeat.beat)
+                server.orders.take_checkpoint()(saved, saving.result or "the checkpoint is not saved: the disk is slow")
         confirmation = self._confirmation.result if self._confirmation is not None else None
         if saving.done.is_set():  # else the disk does not answer
-            reporter.write_summary(finished=finished, ended=ended, confirmation=confirmation)
+            stopped_by = "" if finished else server.orders.stop_cause
+            reporter.write_summary(finished=finished, stopped_by=stopped_by, ended=ended, confirmation=confirmation)
         env_steps = f"{context.counters.env_steps:,} env_steps"
         if finished:
             server.await_departures()
@@ -180,9 +185,16 @@ class LearnerService:
             finished=finished,
             saved=saved,
             seconds_to_target=context.counters.seconds_to_target,
-            ordered=self._server.orders.stopped,
+            stopped_by=self._server.orders.stopped_by,
             superseded_by=self._server.orders.superseded_by,
         )
 
+    @property
+    def _why_stopped(self) -> str:
+        """The reason for actors and for the events, if the run is stopped."""
+        author = self._server.orders.stopped_by
+        return f"{STOPPED_BY}{author}" if author else _STOPPED
+
     def _status(self) -> RunStatus:
-        return self._reporter.status(self._server.rollouts.queue_bytes, time.monotonic())
+        status = self._reporter.status(self._server.rollouts.queue_bytes, time.monotonic())
+        return status.model_copy(update={"last_order": self._server.orders.last})

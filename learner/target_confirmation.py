@@ -160,7 +160,10 @@ class TargetConfirmation:
             self._context.counters.forget_returns()
         ended = time.monotonic()
         self._not_before = ended + (ended - began)
-        text = f"not confirmed: return {short_number(result['return_mean'])}; training continues"
+        text = (
+            f"not there yet: the new episodes have a mean return of {short_number(result['return_mean'])}. That is "
+            "normal: the first mean that reaches a target is often a lucky one. Training goes on, and tries again"
+        )
         self._context.events.add("target", text, cause=f"result of version {version}")
         return False
 

@@ -1,7 +1,9 @@
 """What the user's code does to this process: errors, in one line with their place, and another working directory."""
 
 import os
+import re
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -9,6 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from daedalus.policy.user_modules import shown_path
+from daedalus.protocol.texts import printable
 
 _NOT_OF_USERS = {"daedalus", "gymnasium", "numpy", "torch", *sys.stdlib_module_names}  # packages
 
@@ -43,6 +46,22 @@ def place_of(error: BaseException | None) -> str:
     for frame in filter(is_of_user, frames_of(error)):
         place = f" ({shown_path(frame.tb_frame.f_code.co_filename)}, line {frame.tb_lineno})"
     return place
+
+
+def names_place(text: str) -> bool:
+    """Return whether a text names the place of an error, as `place_of` does."""
+    return re.search(r" \([^()]+, line \d+\)", text) is not None
+
+
+def print_traceback(error: BaseException) -> None:
+    """Print the user's part of a traceback, or all of it if it has none, to standard error.
+
+    An error in one line is then enough for the terminal: the launcher of a run keeps tracebacks in output.log only.
+    """
+    part = next(filter(is_of_user, frames_of(error)), error.__traceback__)
+    with suppress(OSError, ValueError, AttributeError):  # closed, or none
+        sys.stderr.write(printable("".join(traceback.format_exception(type(error), error, part))))
+        sys.stderr.flush()
 
 
 class Surroundings:

@@ -12,6 +12,8 @@ _KEPT, _DIGEST = 55, 8  # characters of a name that is made from a text, which i
 _MAX_SHOWN = 80  # characters of an invalid name, which may come from a peer
 
 ANY_RUN = "*"
+NO_RUN = "-"  # in place of a run: actors that wait for one. No run has this name
+NO_OPERATOR = "-"  # in place of an operator's name: a process without an operator's certificate. No operator has it
 
 
 def is_name(name: str) -> bool:
@@ -73,18 +75,16 @@ def run_end(run: str) -> str:
     return f"daedalus/{run}/end"
 
 
-def drain(run: str, actor: str) -> str:
-    """Return the key of an operator's requests to drain an actor (`*` for all actors)."""
-    return f"daedalus/{run}/drain/{actor}"
+def orders(run: str, operator: str) -> str:
+    """Return the key of one operator's orders (`*` for all operators): queries to the learner of a run.
 
-
-def orders(run: str) -> str:
-    """Return the key of an operator's orders to the learner."""
-    return f"daedalus/{run}/orders"
+    With NO_RUN they are publications to the actors that wait for a run.
+    """
+    return f"daedalus/{run}/orders/{operator}"
 
 
 def presence(run: str, actor: str, incarnation: int | str) -> str:
-    """Return the liveliness token of one incarnation of an actor (`*` for all)."""
+    """Return the liveliness token of one incarnation of an actor (`*` for all); NO_RUN: while it waits for a run."""
     return f"daedalus/{run}/actors/{actor}/{incarnation}"
 
 

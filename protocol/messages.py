@@ -11,9 +11,11 @@ from typing import Literal
 
 import numpy as np
 
+from daedalus.protocol import keys
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import EPISODE_DTYPES, Gradient, Rollout
 
 
@@ -34,18 +36,42 @@ class ClientReport:
     safe_reason: str = ""  # why it plays the safe action now; empty while the policy acts
 
 
-Order = Literal["stop", "checkpoint"]
+Order = Literal["stop", "checkpoint", "drain"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderRequest:
-    """Order of an operator. Operator -> learner, on `orders`. The answer is an Acknowledgement `accepted`.
+    """Order of an operator to one process, on `orders/{operator}`.
+
+    Operator -> learner, which answers with an Acknowledgement `accepted` or a Refusal; it carries an order out once,
+    and only if the order names its run and its epoch. Operator -> actors that wait for a run, as a publication: the
+    actor of that name and incarnation leaves.
 
     stop: save a checkpoint and end; the run can be resumed.
     checkpoint: save a checkpoint now.
+    drain: ask an actor to leave after its current rollout.
     """
 
     order: Order
+    run: str = ""  # of the learner
+    learner_epoch: int = 0  # likewise
+    number: int = 0  # at random: no other order to this learner has it
+    actor: str = ""  # that is drained
+    incarnation: int = 0  # of an actor that waits for a run
+    # Who gives the order, besides the operator's name in the key, as the sender states it.
+    host: str = ""
+    token: str = ""  # whose token the page of a gateway sent, such as `operator alice`; empty if it is not from a page
+
+    def author(self, operator: str) -> str:
+        """Return who gives the order, for a person; `operator` is the name in the key."""
+        host = f" at {bounded_text(self.host, MAX_NAME)}" if self.host else ""
+        named = operator != keys.NO_OPERATOR
+        if self.token:
+            gateway = f" of operator {bounded_text(operator, MAX_NAME)}" if named else ""
+            return f"the token of {bounded_text(self.token, 2 * MAX_NAME)}, on the page of the gateway{gateway}{host}"
+        if named:
+            return f"operator {bounded_text(operator, MAX_NAME)}{host}"
+        return f"the operator{host}, without an operator's certificate"
 
 
 MAX_PAGE_VALUES = 1 << 16  # numbers in one page
@@ -137,6 +163,7 @@ class ActorStatus(Specification):
     safe_actions: int = 0
     rollouts_dropped: int = 0
     safe_reason: str = ""
+    drained_by: str = ""  # who ordered it to leave; empty if nobody did
 
 
 class RefusedJoin(Specification):
@@ -210,6 +237,8 @@ class RunStatus(Specification):
     actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
+    updates_per_batch: int = 1  # by which a policy lag in updates is one in batches
+    last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
 
     @property
     def fleet_size(self) -> int:
@@ -292,7 +321,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement:
-    """Verdict on a rollout or gradient, a report, an order, or a request on `drain/{actor}`. Learner -> sender.
+    """Verdict on a rollout or gradient, a report, or an order. Learner -> sender.
 
     accepted: it will be trained on, unless the learner ends first or its policy lag exceeds the bound.
     busy: the learner's queue is full; send it again later.

@@ -352,7 +352,7 @@ class ServiceSpec(Specification):
     keep_checkpoints: PositiveInt = 3
     """Number of newest checkpoints to keep."""
     log_seconds: Annotated[float, Field(gt=0.0)] = 0.5
-    """Seconds between rows of metrics."""
+    """Seconds between rows of metrics. Old rows of a run of many hours are merged."""
     queue_megabytes: Annotated[float, Field(gt=0.0)] = 64.0
     """MiB of rollouts that may wait to be decoded. Rollouts beyond this limit are answered `busy`."""
 

@@ -126,6 +126,18 @@ def short_number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}"
 
 
+def policy_lag(updates: float, updates_per_batch: int) -> str:
+    """Return a policy lag as `1 batch (160 updates)`, or as `0.8 updates` where a batch makes one update."""
+    if updates_per_batch == 1:
+        return _counted(updates, "update", "updates")
+    return f"{_counted(updates / updates_per_batch, 'batch', 'batches')} ({_counted(updates, 'update', 'updates')})"
+
+
+def _counted(count: float, one: str, several: str) -> str:
+    text = f"{count:,.1f}".removesuffix(".0")
+    return f"{text} {one if text == '1' else several}"
+
+
 def exact_number(value: float | None) -> str:
     """Return the shortest text that is read as the same number: 475, 1000001, 2e-05 or 16777217.5; empty for None."""
     if value is None:

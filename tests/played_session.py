@@ -32,6 +32,7 @@ class PlayedSession:
 
     Attributes:
       learners: answers to a request to join, by run.
+      silent: nobody answers a query, which then takes the whole time it waits.
       seconds: how long each kind of action takes, by its type.
       performed: all actions so far, besides Work.
     """
@@ -40,6 +41,7 @@ class PlayedSession:
         self.session = ActorSession(config or ActorConfig(name="a", incarnation=7))
         self.learners: dict[str, list[Message]] = {"r": [welcome()]}
         self.seconds: dict[type, float] = {}
+        self.silent = False
         self.performed: list[Any] = []
         self.now = 1000.0
         self.verdict: Any = "accepted"  # of each rollout; None: there is no answer
@@ -108,6 +110,9 @@ class PlayedSession:
 
     def _come_of(self, action: Any) -> Any:
         match action:
+            case Ask() if self.silent:
+                self.now += action.timeout
+                return []
             case Ask(key):
                 return [encode(message) for message in self._answers(key, action.payload)]
             case Wait(until):

@@ -61,9 +61,9 @@ class ScriptedLearner:
         self.transport.serve(keys.evaluations("r", "*"), self.received.put)
         self.transport.serve(keys.program("r", "*"), self._program)
         self.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
-        self.transport.serve(keys.join("r", "*"), self._join)
+        self.transport.serve(keys.join("r", "*"), self.answer_join)
 
-    def _join(self, request: Request) -> None:
+    def answer_join(self, request: Request) -> None:
         message = decode(request.payload, Limits())
         assert isinstance(message, Join)
         self.joins.put(message)

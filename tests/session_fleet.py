@@ -1,12 +1,13 @@
 """A learner and actors of one run, each on a thread of its own, over the memory transport."""
 
 import io
+import itertools
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from processes import LIMIT
+from processes import LIMIT, until
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session.actor_config import ActorConfig
@@ -16,6 +17,10 @@ from daedalus.learner.run.resuming import Beginning
 from daedalus.learner.service import LearnerService, Outcome, Outputs
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.training.checkpoint import load_newest
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
+from daedalus.protocol.messages import Message, Order, OrderRequest, StatusReport
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -124,3 +129,18 @@ class LearnerProcess(Worker):
             return LearnerService(context, transport, outputs, Beginning(restored=restored)).run()
         finally:
             transport.close()
+
+
+def order_to(network: MemoryNetwork, order: Order, actor: str = "", operator: str = "alice", **fields: Any) -> Message:
+    """Give an order to the learner of the run `run`, and return its answer."""
+    transport, reports = MemoryTransport(network), list[bytes]()
+    until(lambda: reports.extend(transport.query(keys.status("run"), timeout=LIMIT)) or reports)
+    report = decode(reports[0], Limits())
+    assert isinstance(report, StatusReport)
+    named = {"run": "run", "learner_epoch": report.status.learner_epoch, "number": next(_numbers), "host": "laptop"}
+    message = OrderRequest(order=order, actor=actor, **{**named, **fields})
+    (answer,) = transport.query(keys.orders("run", operator), encode(message), timeout=LIMIT)
+    return decode(answer, Limits())
+
+
+_numbers = itertools.count()

@@ -46,8 +46,10 @@ def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str,
     policies: list[dict[str, Any]] = [{"rules": ["all"], "subjects": ["learner and routers", "this machine"]}]
     shared = [rule["id"] for rule in _actors_rules()]
     for operator in sorted(operators):
+        rules += _orders_rules(operator)
         subjects.append({"id": f"operator {operator}", "cert_common_names": [common_name("operator", operator)]})
-        policies.append({"rules": ["operators query", "operators receive"], "subjects": [f"operator {operator}"]})
+        allowed = ["operators query", "operators receive", *(rule["id"] for rule in _orders_rules(operator))]
+        policies.append({"rules": allowed, "subjects": [f"operator {operator}"]})
     for actor in sorted(actors):
         rules += _own_rules(actor)
         subjects.append({"id": f"actor {actor}", "cert_common_names": [common_name("actor", actor)]})
@@ -75,7 +77,7 @@ def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressi
 def _actors_rules() -> list[dict[str, Any]]:
     """Return the rules of every actor: query programs and snapshots; subscribe; watch the learner."""
     queried = [keys.program(_RUN, "*"), keys.snapshots(_RUN)]
-    published = [keys.snapshots(_RUN), keys.run_end(_RUN)]
+    published = [keys.snapshots(_RUN), keys.run_end(_RUN), keys.orders(keys.NO_RUN, "*")]
     served = [*queried, *_own_keys("*")]
     return [
         _rule("actors query", ["ingress"], ["query"], queried),
@@ -117,9 +119,9 @@ def _own_rules(actor: str) -> list[dict[str, Any]]:
 
 
 def _operators_rules() -> list[dict[str, Any]]:
-    """Return the rules of operators: query the status, drain actors, give orders, and watch the presence."""
+    """Return the rules of every operator: query the status, and watch the presence."""
     present = [keys.presence(_RUN, "*", "*"), keys.learner(_RUN)]
-    queried = [keys.status(_RUN), keys.drain(_RUN, "*"), keys.orders(_RUN)]
+    queried = [keys.status(_RUN)]
     return [
         _rule(
             "operators query",
@@ -130,7 +132,15 @@ def _operators_rules() -> list[dict[str, Any]]:
         _rule(
             "operators receive",
             ["egress"],
-            ["reply", "declare_queryable", "liveliness_token"],
-            [*queried, *present],
+            ["reply", "declare_queryable", "declare_subscriber", "liveliness_token"],
+            [*queried, *present, keys.orders(_RUN, "*")],
         ),
+    ]
+
+
+def _orders_rules(operator: str) -> list[dict[str, Any]]:
+    """Return the rules of one operator for orders, under its own name only: the name says who gave an order."""
+    return [
+        _rule(f"operator {operator} orders", ["ingress"], ["query"], [keys.orders(_RUN, operator)]),
+        _rule(f"operator {operator} drains waiting actors", ["ingress"], ["put"], [keys.orders(keys.NO_RUN, operator)]),
     ]

@@ -124,6 +124,10 @@ class Transport(QuerySender, Protocol):
         """Call `on_change(key, present)` for every key that is present now, and for every change."""
         ...
 
+    def present(self, key: str) -> list[str]:
+        """Return every key under which a process is present now, as far as they are known within 5 s."""
+        ...
+
     def reopen(self, unless_served: str | None = None) -> bool:
         """Replace a session that may be dead by a new one that repeats all declarations; return whether it did.
 

@@ -164,6 +164,10 @@ class MemoryTransport:
                 if matches(key, declared):
                     on_change(declared, True)
 
+    def present(self, key: str) -> list[str]:
+        """See Transport."""
+        return sorted({declared for end in self._ends() for declared in end._present_keys if matches(key, declared)})
+
     def _report(self, key: str, present: bool) -> None:
         for end in self._ends():
             for pattern, on_change in end._watches:

@@ -45,8 +45,10 @@ def ask(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None
     return [_with_actors(transport, status, max_actors) for status in _newest_first(statuses)]
 
 
-def decoded(answers: Iterable[bytes], kind: type[_Kind], limits: Limits = STATUS_LIMITS) -> list[_Kind]:
-    """Return the messages of a kind among the answers of several learners.
+def decoded(
+    answers: Iterable[bytes], kind: type[_Kind] | tuple[type[_Kind], ...], limits: Limits = STATUS_LIMITS
+) -> list[_Kind]:
+    """Return the messages of a kind, or of several, among the answers of several learners.
 
     One that cannot be read, such as that of another release, is logged and ignored. Raises ProtocolError if no answer
     can be read.
@@ -108,6 +110,16 @@ def ask_events(transport: Transport, status: RunStatus) -> EventsPage | None:
         if report.page.learner_epoch == status.learner_epoch:
             return report.page
     return None
+
+
+def waiting_actors(transport: Transport) -> dict[str, list[int]]:
+    """Return the names and incarnations of the actors that wait for a run. Raises TransportError."""
+    found: dict[str, list[int]] = {}
+    for key in transport.present(keys.presence(keys.NO_RUN, "*", "*")):
+        parsed = keys.parse_presence(key)
+        if parsed is not None and keys.is_name(parsed[0]):
+            found.setdefault(parsed[0], []).append(parsed[1])
+    return dict(sorted(found.items()))
 
 
 def _with_actors(transport: Transport, status: RunStatus, max_actors: int | None) -> RunStatus:

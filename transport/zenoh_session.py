@@ -19,6 +19,7 @@ from daedalus.transport.interface import AddressInUseError, RefusedError, Transp
 from daedalus.transport.zenoh_settings import Capacity, session_settings
 
 _PROBE_SECONDS = 3.0
+_ADDRESS_ADVICE = "is the learner or router running, and is this its address?"
 
 
 class Diagnosis(NamedTuple):
@@ -38,12 +39,38 @@ def diagnose_connection(endpoint: str, credentials: Credentials | None) -> Diagn
         link = socket.create_connection((host.strip("[]"), int(port)), timeout=_PROBE_SECONDS)
     except socket.gaierror:
         return Diagnosis(_unresolved(host), False)
-    except (OSError, ValueError):
-        return Diagnosis(f"nothing answers at {endpoint}", False)
+    except TimeoutError:
+        return Diagnosis(no_answer([endpoint]), False)
+    except ConnectionRefusedError:
+        return Diagnosis(f"nothing answers at {endpoint}: {_ADDRESS_ADVICE}", False)
+    except (OSError, ValueError) as error:
+        return Diagnosis(f"nothing answers at {endpoint} ({error}): {_ADDRESS_ADVICE}", False)
     with link:
         if credentials is None or not endpoint.startswith("tls/"):
-            return Diagnosis(f"the service at {endpoint} uses another protocol, or requires --tls", False)
+            return Diagnosis(f"the service at {endpoint} uses another protocol, is stopped, or requires --tls", False)
         return _diagnose_refusal(link, host, endpoint, credentials)
+
+
+def no_answer(endpoints: list[str]) -> str:
+    """Return the message where nothing answers for seconds, with what to check."""
+    return (
+        f"no answer from {' or '.join(endpoints)}: check the address, that its host is up, and that no firewall drops "
+        "packets to this port"
+    )
+
+
+def resolved(endpoint: str) -> list[str]:
+    """Return an endpoint with each address of its host in place of the name; none if it has no address."""
+    if socket_path(endpoint) is not None:
+        return [endpoint]
+    protocol, _, rest = endpoint.partition("/")
+    host, _, port = rest.rpartition(":")
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+    except (OSError, ValueError):
+        return []
+    addresses = [str(address[0]) for *_, address in found]
+    return [f"{protocol}/[{each}]:{port}" if ":" in each else f"{protocol}/{each}:{port}" for each in addresses]
 
 
 def unresolved_host(endpoint: str) -> str:
@@ -70,7 +97,7 @@ def _diagnose_socket(path: str) -> str:
         except PermissionError:
             return f"{path} belongs to another user"
         except OSError:
-            return f"nothing answers at {path}"
+            return f"nothing answers at {path}: {_ADDRESS_ADVICE}"
     return f"the service at {path} uses another protocol"
 
 

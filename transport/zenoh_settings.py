@@ -97,9 +97,8 @@ def _small_queries() -> list[dict[str, Any]]:
             keys.program("*", "*"),
             keys.snapshots("*"),
             keys.status("*"),
-            keys.drain("*", "*"),
             keys.reports("*", "*"),
-            keys.orders("*"),
+            keys.orders("*", "*"),
         ),
         rule("evaluations", EVALUATION_LIMITS.message_bytes, keys.evaluations("*", "*")),
     ]

@@ -34,7 +34,7 @@ from daedalus.transport.zenoh_declarations import (
     ZenohPresence,
     ZenohRequest,
 )
-from daedalus.transport.zenoh_session import OpenSession, error_text, session_opener
+from daedalus.transport.zenoh_session import OpenSession, error_text, resolved, session_opener
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _DESCRIPTORS = Path("/dev/fd")  # of this process
@@ -87,6 +87,7 @@ def _remove_from(descriptor: int) -> None:
 _logger = logging.getLogger(__name__)
 
 _CLOSE_SECONDS = 2.0  # Zenoh waits up to 10 s for a router that does not answer
+_PRESENT_SECONDS = 5.0  # for a query of presence
 _PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
 _RENEW_SECONDS, _RENEW_PAUSE_SECONDS = 10.0, 0.05  # for the address of a closed session to become free
 
@@ -97,7 +98,7 @@ def listen(
     credentials: Credentials | None = None,
     *,
     max_message_bytes: int = MAX_MESSAGE_BYTES,
-) -> Transport:
+) -> "ZenohTransport":
     """Open a router that listens on `endpoints` and connects to the routers at `connect`.
 
     Endpoints are `tcp/HOST:PORT` or `tls/HOST:PORT`. With `credentials` the router admits the names that their folder
@@ -173,6 +174,14 @@ class ZenohTransport:
             for link in self._session.info.links():
                 return link.src.partition("/")[0] if link.src.startswith("unixsock") else link.src
         return ""
+
+    def unreached(self, endpoints: list[str]) -> list[str]:
+        """Return those of the endpoints to whose hosts there is no connection, whichever end has opened it."""
+        try:
+            reached = {link.dst.rpartition(":")[0] for link in self._session.info.links()}
+        except zenoh.ZError:  # the session was closed, or is being renewed
+            return []
+        return [each for each in endpoints if not reached & {one.rpartition(":")[0] for one in resolved(each)}]
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""
@@ -269,6 +278,12 @@ class ZenohTransport:
 
         with _as_transport_error(f"watch presence under {key}"):
             self._declarations.add(declare)
+
+    def present(self, key: str) -> list[str]:
+        """See Transport."""
+        with _as_transport_error(f"query presence under {key}"):
+            replies = self._session.liveliness().get(key, timeout=_PRESENT_SECONDS)
+            return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def reopen(self, unless_served: str | None = None) -> bool:
         """See Transport. A router is never reopened: its address would still be in use by itself."""

@@ -21,9 +21,10 @@ class EnvironmentReport(Specification):
     warnings: tuple[str, ...] = ()  # training would run, perhaps not as intended
     notes: tuple[str, ...] = ()  # advice of gymnasium's own checker
     env_steps: int = 0  # played
-    step_seconds: float = 0.0  # mean
+    step_seconds: float = 0.0  # mean, without the first step, which may compile or load something
     busy_share: float = 1.0  # processor time of the steps, as a share of their duration
     reset_seconds: float = 0.0  # mean
+    vectorized: bool = False  # training plays it by a vector entry point of its own
     time_limit: int | None = None  # at which gymnasium truncates episodes
     pixel_maxima: dict[str, int] = Field(default_factory=dict)  # largest value seen in each image, by component
     lengths: tuple[int, ...] = ()  # of the episodes that ended
@@ -41,8 +42,9 @@ class EnvironmentReport(Specification):
 
 def advice(report: EnvironmentReport, spec: RunSpec, processors: int) -> list[str]:
     """Return advice for the run. See the functions below."""
+    slow = slow_steps(report, spec, processors)
     texts = (
-        slow_steps(report, spec, processors),
+        f"{slow}; use --set environment.processes=true" if slow else "",
         float_images(report, spec),
         stacked_images(report, spec),
         small_pixels(report, spec),
@@ -52,11 +54,12 @@ def advice(report: EnvironmentReport, spec: RunSpec, processors: int) -> list[st
 
 
 def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str:
-    """Return advice if each actor's environments should have processes of their own, else an empty string.
+    """Return why each actor's environments should have processes of their own, or an empty string.
 
     Processes help where steps wait for something else, or where processors would be idle.
     """
-    if not _in_turn(spec):
+    chosen = "processes" in spec.environment.model_fields_set
+    if chosen or report.vectorized or not _in_turn(spec):
         return ""
     environments = spec.collection.envs_per_actor
     idle = report.busy_share < _BUSY or processors > spec.collection.actors
@@ -66,7 +69,7 @@ def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str
     first = row * spec.collection.rollout_length
     return (
         f"a step takes {_duration(report.step_seconds)}, and an actor steps its {environments} environments in turn: "
-        f"{_duration(row)} a row, {_duration(first)} a rollout; use --set environment.processes=true"
+        f"{_duration(row)} a row, {_duration(first)} a rollout"
     )
 
 

@@ -29,7 +29,7 @@ from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
-from daedalus.policy.user_code import first_line, place_of
+from daedalus.policy.user_code import first_line, place_of, print_traceback
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
@@ -209,7 +209,9 @@ def check_environment(
         return report
     left_out = spec.model_copy(update={"leave_out": (*spec.leave_out, *report.constant_texts)})
     problem = vectorized_problem(left_out, modules, report.spaces, seed) or _evaluated_problem(spec, modules, report)
-    return report.model_copy(update={"problems": (problem,)}) if problem else report
+    if problem:
+        return report.model_copy(update={"problems": (problem,)})
+    return report.model_copy(update={"vectorized": uses_vector_entry_point(spec, modules)})
 
 
 def _evaluated_problem(spec: EnvironmentSpec, modules: UserModules, trained: EnvironmentReport) -> str:
@@ -316,7 +318,7 @@ class _Play:
             problems=tuple(f"environment {self._name}: {problem}" for problem in problems),
             warnings=tuple(f"environment {self._name}: {warning}" for warning in warnings),
             env_steps=self._env_steps,
-            step_seconds=self._step_seconds / max(self._env_steps, 1),
+            step_seconds=self._step_seconds / max(self._env_steps - 1, 1),
             busy_share=min(self._busy_seconds / max(self._step_seconds, 1e-9), 1.0),
             reset_seconds=self._reset_seconds / max(self._resets, 1),
             time_limit=getattr(self._environment.spec, "max_episode_steps", None),
@@ -340,6 +342,8 @@ class _Play:
         action = self._transforms.env_action(self._random_actions.choose(self._masks))
         if not self._env_steps:
             self._batch("action", self._environment.action_space, action)
+        if self._env_steps == 1:
+            self._step_seconds = self._busy_seconds = 0.0  # the first step may have compiled something
         began, busy = time.monotonic(), time.process_time()
         result = self._call("step", action)
         self._busy_seconds += time.process_time() - busy
@@ -385,6 +389,8 @@ class _Play:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
             wrong = self._structure_of(method, arguments, keywords) if isinstance(error, TypeError | ValueError) else ""
+            if not wrong:
+                print_traceback(error)
             raise _ProblemError(wrong or f"{method} raises {first_line(error)}{place_of(error)}") from None
 
     def _structure_of(self, method: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> str:

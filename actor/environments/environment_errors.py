@@ -2,7 +2,6 @@
 
 import difflib
 import importlib
-import logging
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -11,10 +10,8 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from pydantic import ValidationError
 
-from daedalus.policy.user_code import first_line, frames_of, is_of_user, place_of
+from daedalus.policy.user_code import first_line, frames_of, is_of_user, place_of, print_traceback
 from daedalus.policy.user_modules import USER_STATE, file_of, hidden_file
-
-_logger = logging.getLogger(__name__)
 
 _FLATTEN = ", or make one array of them: --wrap gymnasium.wrappers:FlattenObservation"
 OTHER_BACKEND = "or use another backend (--set environment.backend=gymnasium)"
@@ -125,16 +122,14 @@ def creation_errors(environment: str, hint: str = "") -> Iterator[None]:
             f"environment {environment} needs a package that is not installed: {remedy}"
         ) from None
     except (Exception, SystemExit) as error:  # broad: the constructor of a user's environment may raise anything
+        print_traceback(error)
         raise EnvironmentSetupError(
             f"environment {environment} cannot be created: {first_line(error)}{place_of(error)}{hint}"
         ) from error
 
 
 def playing_error(environment: str, call: str, error: BaseException) -> EnvironmentSetupError:
-    """Return the error for an exception that an environment raised while it played.
-
-    The message has one line. Where the exception passed several functions of the user, that line does not explain it:
-    the traceback of the user's part is then logged.
+    """Return the error, of one line, for an exception that an environment raised while it played. Print its traceback.
 
     Args:
       environment: its id.
@@ -145,9 +140,8 @@ def playing_error(environment: str, call: str, error: BaseException) -> Environm
         if frame.tb_frame.f_code.co_name in ("reset", "step"):
             call = frame.tb_frame.f_code.co_name
         if is_of_user(frame):
-            if frame.tb_next is not None or error.__cause__ is not None:
-                _logger.error("environment %s: %s failed", environment, call, exc_info=(type(error), error, frame))
             break
+    print_traceback(error)
     return EnvironmentSetupError(f"environment {environment}: {call} raises {first_line(error)}{place_of(error)}")
 
 

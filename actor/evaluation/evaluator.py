@@ -18,6 +18,7 @@ import numpy as np
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.vector_environments import VectorEnvironment
+from daedalus.actor.errors import LearnerLostError
 from daedalus.actor.evaluation.episodes import (
     EvaluationProgress,
     cut_note,
@@ -115,6 +116,7 @@ class Evaluator:
 
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
+        self._thread.call(self._session.end_waiting)
         self._on_join(welcome)
         spec, wanted, at_once = welcome.spec, welcome.spec.evaluation, welcome.play_episodes > 0
         interval = 0.0 if at_once else wanted.seconds or _DEFAULT_SECONDS
@@ -129,7 +131,10 @@ class Evaluator:
         try:
             if at_once:  # nobody else checks that the policy fits the environment
                 join = replace(self._session.join, spaces=environments.spaces, environments=count)
-                self._thread.run(self._session.confirm(welcome, join))
+                try:
+                    self._thread.run(self._session.confirm(welcome, join))
+                except LearnerLostError:
+                    return  # there is something else to play by now
             due = time.monotonic() + interval
             for number in itertools.count():
                 self._thread.run(self._session.pause(due - time.monotonic()))

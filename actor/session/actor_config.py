@@ -28,6 +28,7 @@ class ActorConfig:
     modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: as on a fast link; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
+    searched_since: float | None = None  # monotonic time when the search began; None: once there is a connection
     waits_for_return: bool = False  # whether to look for ever for a learner that has gone, whatever the timeout
     max_policy_age: float | None = None  # seconds within which the learner must confirm the policy; None: no limit
     any_run: bool = False  # whether the actor may change to another run when its learner has gone

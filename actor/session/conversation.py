@@ -23,13 +23,25 @@ from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, UnfitMessageError, VersionMismatchError, decode, encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, LEARNER_LIMITS
-from daedalus.protocol.messages import UNKNOWN, Join, Message, Origin, Program, Refusal, RunEnded, Welcome, starts_of
+from daedalus.protocol.messages import (
+    UNKNOWN,
+    Join,
+    Message,
+    OrderRequest,
+    Origin,
+    Program,
+    Refusal,
+    RunEnded,
+    Welcome,
+    starts_of,
+)
 from daedalus.protocol.spec import UnsupportedRunError
-from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
+from daedalus.protocol.texts import MAX_ANSWER_TEXT, MAX_NAME, bounded_text
 
 _logger = logging.getLogger(__name__)
 
 _ANSWER_SECONDS = 5.0  # for a query that is answered at once
+_LATE_SECONDS = 0.5  # for a query after the time to look for a learner
 _REPORT_SECONDS, _MAX_FAILURE = 2.0, 300  # for the report of a failure, and its length in characters
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
@@ -38,7 +50,7 @@ _STEP_DOWN_SECONDS = 5.0  # for the older of two learners of a run to notice the
 _REOPEN_SECONDS = 5.0  # without an answer for so long, the session may be dead: open another
 _SILENCE_SECONDS = 10.0  # without a message for so long, ask whether the learner is there
 
-DRAINED = "an operator drained this actor: it leaves the run"
+WAITING_ORDERS = keys.orders(keys.NO_RUN, "*")  # to actors that wait for a run
 
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Any, Any, Result]  # yields actions, is sent what came of each, returns a result
@@ -116,7 +128,14 @@ class DeclarePresence:
     key: str
 
 
-AtOnce: TypeAlias = Query | Subscribe | Unsubscribe | WatchPresence | DeclarePresence
+@dataclass(frozen=True, slots=True)
+class WithdrawPresence:
+    """Be present under a key no longer. Idempotent."""
+
+    key: str
+
+
+AtOnce: TypeAlias = Query | Subscribe | Unsubscribe | WatchPresence | DeclarePresence | WithdrawPresence
 
 
 class RunOverError(Exception):
@@ -137,6 +156,8 @@ class Conversation:
       heard_at: the time of the last message of the learner.
     """
 
+    is_actor = True  # whether operators may see that it waits for a run, and drain it then
+
     def __init__(self, config: ActorConfig, origin: Origin = UNKNOWN) -> None:
         """`origin` says where this process runs, for the operator who reads the status."""
         self.config = config
@@ -150,17 +171,27 @@ class Conversation:
         self._learner_stopped = False  # since `follow`
         self._actions: list[AtOnce] = []
         self._noted = ""  # the last warning of another release
+        self._waits = False  # whether it shows that it waits for a run
 
     # ------------------------------------------------------------------------------------------------ events
 
     def received(self, key: str, data: bytes) -> None:
         """Receive the newest value of a key that is subscribed to."""
-        if key != keys.run_end(self.run):
+        if key not in (WAITING_ORDERS, keys.run_end(self.run)):
             return
         with contextlib.suppress(ProtocolError):
             message = decode(data, ACKNOWLEDGEMENT_LIMITS)
-            if isinstance(message, RunEnded):
+            if isinstance(message, RunEnded) and key != WAITING_ORDERS:
                 self.run_ended(message)
+            if isinstance(message, OrderRequest) and key == WAITING_ORDERS:
+                self._ordered(message)
+
+    def _ordered(self, message: OrderRequest) -> None:
+        """Obey an order to this actor while it waits for a run."""
+        this = self.join.actor, self.join.incarnation
+        if message.order == "drain" and (message.actor, message.incarnation) == this and self._waits:
+            host = f" at {bounded_text(message.host, MAX_NAME)}" if message.host else ""
+            self._over = RunOverError(f"drained by an operator{host} while it waited for a run")
 
     def presence_changed(self, present: bool) -> None:
         """Note that a learner of the run came or left."""
@@ -258,6 +289,7 @@ class Conversation:
         if confirmed.learner_epoch != welcome.learner_epoch:
             raise LearnerLostError
         self._has_joined = True
+        self.end_waiting()
         return confirmed
 
     @property
@@ -267,7 +299,8 @@ class Conversation:
 
     def _join_learner(self, run: str, join: Join, *, asks_only: bool = False) -> Steps[Welcome]:
         timeout, began = self._timeout, self.now
-        deadline = None if timeout is None else began + timeout
+        since = began if self.run or self.config.searched_since is None else self.config.searched_since
+        deadline = None if timeout is None else since + timeout
         pause, logged, log_at, reopen_at = _FIRST_RETRY_SECONDS, "", 0.0, began + _REOPEN_SECONDS
         name_free_by = began + (_NAME_IN_USE_SECONDS if timeout is None else min(_NAME_IN_USE_SECONDS, timeout))
         alone_by: float | None = None
@@ -275,7 +308,7 @@ class Conversation:
             self.check_over()  # a request may take 5 s
             awaited, welcomes = "", list[Welcome]()
             try:
-                welcomes = yield from self._request_joins(run, join)
+                welcomes = yield from self._request_joins(run, join, deadline)
             except NameInUseError:
                 if self.now > name_free_by:
                     raise
@@ -292,9 +325,12 @@ class Conversation:
                 remedy = yield from self._remedy(run, join)
                 raise NoLearnerError(f"no learner answered within {timeout:g} s: {remedy}")
             if pause >= _MAX_RETRY_SECONDS and self.now >= log_at and not asks_only:
+                if not awaited:
+                    self._show_waiting()
                 log_at = self.now + _LOOK_AROUND_SECONDS
                 self.check_over()  # the request may have taken 5 s, and the next one may too
-                text = f"waiting for {awaited or (yield from self._awaited(run, join))}"
+                there = [] if awaited or run == keys.ANY_RUN else (yield from self._runs(join))
+                text = f"waiting for {awaited or _awaited(run, there)}"
                 if text != logged:
                     _logger.info("%s", text)
                 logged = text
@@ -303,6 +339,22 @@ class Conversation:
             if self.now > reopen_at and not asks_only:
                 yield Reopen()
                 reopen_at = self.now + _REOPEN_SECONDS
+
+    def _show_waiting(self) -> None:
+        """Let operators see that this actor waits for a run, and drain it."""
+        if self.is_actor and not self._waits:
+            self._waits = True
+            self.act(Subscribe(WAITING_ORDERS), DeclarePresence(self._waiting_key))
+
+    def end_waiting(self) -> None:
+        """Show no longer that this actor waits for a run: it takes part in one."""
+        if self._waits:
+            self._waits = False
+            self.act(WithdrawPresence(self._waiting_key), Unsubscribe(WAITING_ORDERS))
+
+    @property
+    def _waiting_key(self) -> str:
+        return keys.presence(keys.NO_RUN, self.join.actor, self.join.incarnation)
 
     def pause(self, seconds: float) -> Steps[None]:
         """Let time pass. Raises as `check_over` does."""
@@ -313,32 +365,28 @@ class Conversation:
 
     def _remedy(self, run: str, join: Join) -> Steps[str]:
         """Return what to do where no learner of the run answers."""
-        if run != keys.ANY_RUN and (yield from self._runs(join)):
-            return f"waited for {yield from self._awaited(run, join)}; choose with --run"
+        if run != keys.ANY_RUN and (there := (yield from self._runs(join, _LATE_SECONDS))):
+            return f"waited for {_awaited(run, there)}; choose with --run"
         return "check that the learner runs and that the address is correct"
 
-    def _awaited(self, run: str, join: Join) -> Steps[str]:
-        """Return which learner the actor waits for, and which runs are there instead."""
-        if run == keys.ANY_RUN:
-            return "a learner"
-        there = ", ".join(repr(name) for name in (yield from self._runs(join)) if name != run)
-        return f"a learner of run {run!r}" + (f"; the runs here are {there}" if there else "")
-
-    def _runs(self, join: Join) -> Steps[list[str]]:
-        """Return the names of the runs whose learners answer."""
+    def _runs(self, join: Join, within: float = _ANSWER_SECONDS) -> Steps[list[str]]:
+        """Return the names of the runs whose learners answer in time."""
         request, runs = encode(replace(join, spaces=None, environments=0)), set[str]()
-        for answer in (yield Ask(keys.join(keys.ANY_RUN, join.actor), request)):
+        for answer in (yield Ask(keys.join(keys.ANY_RUN, join.actor), request, within)):
             with contextlib.suppress(ProtocolError):  # a learner of another version is not the one awaited
                 message = decode(answer, LEARNER_LIMITS)
                 runs.update({message.run} if isinstance(message, Welcome) else ())
         return sorted(runs)[:_MAX_RUNS]
 
-    def _request_joins(self, run: str, join: Join) -> Steps[list[Welcome]]:
+    def _request_joins(self, run: str, join: Join, deadline: float | None) -> Steps[list[Welcome]]:
         """Send a request to join; return the answers of the learners of one run, the newest first.
+
+        The answers are awaited until a little after the deadline at most.
 
         Raises ActorError or RunOverError if refused, and ActorError if learners of several runs answer.
         """
-        answers = yield from self.ask(keys.join(run, join.actor), encode(join))
+        within = _ANSWER_SECONDS if deadline is None else max(min(deadline - self.now, _ANSWER_SECONDS), _LATE_SECONDS)
+        answers = yield from self.ask(keys.join(run, join.actor), encode(join), within)
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
         names = sorted({welcome.run for welcome in welcomes})
         if len(names) > 1:
@@ -389,9 +437,9 @@ class Conversation:
                     return model
         return None
 
-    def ask(self, key: str, payload: bytes = b"") -> Steps[list[Message]]:
+    def ask(self, key: str, payload: bytes = b"", within: float = _ANSWER_SECONDS) -> Steps[list[Message]]:
         """Send a query and return the decoded answers. Raises ActorError if all are of another release."""
-        answers = yield Ask(key, payload)
+        answers = yield Ask(key, payload, within)
         return (yield Work(partial(self._decode_all, answers)))
 
     def _decode_all(self, answers: list[bytes]) -> list[Message]:
@@ -429,6 +477,14 @@ class Conversation:
             return None
 
 
+def _awaited(run: str, there: list[str]) -> str:
+    """Return which learner an actor waits for, and which runs are there instead."""
+    if run == keys.ANY_RUN:
+        return "a learner"
+    others = ", ".join(repr(name) for name in there if name != run)
+    return f"a learner of run {run!r}" + (f"; the runs here are {others}" if others else "")
+
+
 def _log_several(welcomes: list[Welcome]) -> None:
     newest = welcomes[0]
     _logger.warning(
@@ -445,4 +501,10 @@ def _raise_if_over(answers: list[Message]) -> None:
         if isinstance(answer, Refusal) and answer.code == "finished":
             raise RunOverError("the run is over", finished=True)
         if isinstance(answer, Refusal) and answer.code == "drained":
-            raise RunOverError(DRAINED)
+            raise drained(answer.reason)
+
+
+def drained(reason: str) -> RunOverError:
+    """Return why this actor leaves, as the learner says: who ordered it."""
+    order = bounded_text(reason, MAX_ANSWER_TEXT) or "drained by an operator"
+    return RunOverError(f"{order}: this actor leaves the run")

@@ -20,9 +20,10 @@ from daedalus.actor.session.conversation import (
     Unsubscribe,
     Wait,
     WatchPresence,
+    WithdrawPresence,
     Work,
 )
-from daedalus.transport.interface import Inbox, QuerySender, RefusedError, Transport, TransportError
+from daedalus.transport.interface import Declaration, Inbox, QuerySender, RefusedError, Transport, TransportError
 from daedalus.transport.slow_calls import SlowCall
 
 _POLL_SECONDS = 0.2  # how soon a wait notices `stop`
@@ -44,7 +45,8 @@ class SessionThread:
         self._events = 0  # how many have come: one that comes between a step and its wait ends the wait at once
         self._seen_events = 0  # before the last step
         self._inboxes: dict[str, Inbox] = {}  # by key
-        self._declared: set[str] = set()  # keys of presence, watched and declared
+        self._watched: set[str] = set()  # keys of presence
+        self._declared: dict[str, Declaration] = {}  # likewise
 
     def run(
         self, steps: Steps[Result], perform: Callable[[Any], Any] = lambda _: None, *, to_the_end: bool = False
@@ -182,13 +184,15 @@ class SessionThread:
                 if key in self._inboxes:
                     self._inboxes.pop(key).close()
             case WatchPresence(key):
-                if key not in self._declared:
+                if key not in self._watched:
                     self._transport.watch_presence(key, self._on_presence)
-                    self._declared.add(key)
+                    self._watched.add(key)
             case DeclarePresence(key):
                 if key not in self._declared:
-                    self._transport.declare_presence(key)
-                    self._declared.add(key)
+                    self._declared[key] = self._transport.declare_presence(key)
+            case WithdrawPresence(key):
+                if key in self._declared:
+                    self._declared.pop(key).close()
 
     def _on_news(self) -> None:
         self.notify(lambda: None)

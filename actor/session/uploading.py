@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from daedalus.actor.errors import ActorError, ActorRefusedError, LearnerLostError
-from daedalus.actor.session.conversation import DRAINED, Query, RunOverError
+from daedalus.actor.session.conversation import Query, RunOverError, drained
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
@@ -173,7 +173,7 @@ class Uploads:
         if ended_by == "finished":
             raise RunOverError("the run is over", finished=True)
         if ended_by == "drained":
-            raise RunOverError(DRAINED)
+            raise drained(self.in_flight.reason)
 
     def _on_answer(self, in_flight: InFlightRollouts, sequence: int, data: bytes | None, now: float) -> None:
         """Receive an answer, or None without one."""

@@ -98,7 +98,7 @@ def _episodes() -> tuple[bool, bool]:
             for _ in range(_EPISODES):
                 if learner.process.poll() is not None or hostile.send(**_ending(hostile)).verdict == "fenced":
                     break
-            here.wait("a confirmation", lambda: learner.process.poll() is not None or "not confirmed" in learner.output)
+            here.wait("a confirmation", lambda: learner.process.poll() is not None or "not there yet" in learner.output)
         return accepted, learner.process.poll() is not None
 
 

@@ -26,7 +26,7 @@ def kills(count: int) -> list[tuple[str, str]]:
             name = f"actor-{choose.randrange(8)}"
             before = here.actor(name)
             assert before is not None
-            os.kill(here.process("--name", name, here.address), signal.SIGKILL)
+            os.kill(here.process("--name", name), signal.SIGKILL)
             began = time.monotonic()
             updates.append(_longest_pause(here, name, before.lives, before.env_steps))
             back.append(time.monotonic() - began)
@@ -212,8 +212,10 @@ def solve(seeds: int) -> list[tuple[str, str]]:
                 if status is not None:
                     bad = status.rollouts_rejected.get("unfit", 0)
                 if status is not None and time.monotonic() > next_kill:
-                    os.kill(here.process("--name", f"actor-{choose.randrange(2)}", here.address), signal.SIGKILL)
-                    next_kill, killed = time.monotonic() + 5.0, killed + 1
+                    actor = here.find_process("--name", f"actor-{choose.randrange(2)}")
+                    if actor is not None:  # else it is restarting, or the run has ended
+                        os.kill(actor, signal.SIGKILL)
+                        next_kill, killed = time.monotonic() + 5.0, killed + 1
                 time.sleep(0.1)
             if training.wait() != 0:
                 raise FailedError(training.output)

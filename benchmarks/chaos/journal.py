@@ -19,7 +19,7 @@ from daedalus.transport.interface import Transport
 
 
 class JournalTransport:
-    """Transport that writes each `query_async` and its answer to a file before it continues."""
+    """Transport that writes each rollout and its answer to a file before it continues."""
 
     def __init__(self, transport: Transport, path: str) -> None:
         self._transport = transport
@@ -29,8 +29,10 @@ class JournalTransport:
         self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]
     ) -> None:
         """See Transport."""
-        rollout = decode(payload, Limits())
-        assert isinstance(rollout, Rollout)
+        rollout = decode(payload, Limits()) if payload else None
+        if not isinstance(rollout, Rollout):
+            self._transport.query_async(key, payload, timeout=timeout, on_answer=on_answer)
+            return
         identity = rollout.identity
         name = f"{identity.learner_epoch}/{identity.incarnation}/{identity.sequence}"
         os.write(self._file, f"sent {name}\n".encode())

@@ -34,7 +34,7 @@ def kills(count: int) -> list[tuple[str, str]]:
         checkpoints = here.folder / "fallen" / "checkpoints"
         here.wait("a checkpoint", lambda: _durable(checkpoints) > -1)
         for number in range(count):
-            victim = here.process("--prepared", here.address)
+            victim = here.process("--prepared")
             if number % 5:
                 stage = _await_stage(checkpoints, choose)
             else:
@@ -141,7 +141,7 @@ def stops(count: int) -> list[tuple[str, str]]:
             training = here.start("train", "cartpole", "--listen", here.address, "--run-dir", "stopped", *ENDLESS)
             here.wait_for_training("actor-0")
             here.wait_for_training("actor-1")
-            os.kill(here.process("--name", "actor-0", here.address), signal.SIGSTOP)
+            os.kill(here.process("--name", "actor-0"), signal.SIGSTOP)
             number_of_signal = signal.SIGTERM if number % 2 else signal.SIGINT
             began = time.monotonic()
             training.process.send_signal(number_of_signal)

@@ -102,16 +102,27 @@ class Scene:
         before = self.env_steps(*names)
         return self.wait(f"training of {names or 'all'}", lambda: self.env_steps(*names) > before)
 
+    def find_process(self, *texts: str) -> int | None:
+        """Return the id of the one process of this scene whose command line contains all texts, or None."""
+        mentioning = (set(processes_mentioning(text)) for text in texts)
+        found = set.intersection(set(self._process_ids()), *mentioning)
+        return found.pop() if len(found) == 1 else None
+
     def process(self, *texts: str) -> int:
-        """Wait for the one process whose command line contains all texts; return its id."""
-        found: list[int] = []
+        """Wait for that process; return its id."""
+        self.wait(f"one process of {texts}", lambda: self.find_process(*texts))
+        found = self.find_process(*texts)
+        assert found is not None
+        return found
 
-        def find() -> bool:
-            found[:] = sorted(set.intersection(*(set(processes_mentioning(text)) for text in texts)))
-            return len(found) == 1
-
-        self.wait(f"one process of {texts}", find)
-        return found[0]
+    def _process_ids(self) -> Iterator[int]:
+        """Yield the ids of the processes that were started here, and of those that they started."""
+        waiting = [running.process.pid for running in self._running]
+        while waiting:
+            yield (process := waiting.pop())
+            with contextlib.suppress(OSError):  # it ends meanwhile
+                for children in Path(f"/proc/{process}/task").glob("*/children"):
+                    waiting += map(int, children.read_text().split())
 
     def close(self) -> None:
         """End all processes."""

@@ -95,7 +95,7 @@ def _add_connection(options: argparse.ArgumentParser) -> None:
         choices=("auto", "lan", "wan"),
         default="auto",
         help="lan: fetch whole snapshots. wan: fetch snapshots as bfloat16 differences, as often as the link "
-        "allows (default: %(default)s, which measures the link)",
+        "allows (default: %(default)s, which measures the link, unless it is a Unix socket)",
     )
     options.add_argument(
         "--timeout",

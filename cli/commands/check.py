@@ -12,7 +12,13 @@ import numpy as np
 from daedalus.actor.checking.check_report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.settings_arguments import add_settings, run_choice
-from daedalus.launch.environment_check import CheckTimeoutError, EnvironmentCheck, check_in_process, with_preset
+from daedalus.launch.environment_check import (
+    CheckTimeoutError,
+    EnvironmentCheck,
+    check_in_process,
+    with_measured_processes,
+    with_preset,
+)
 from daedalus.launch.logs import print_error, say
 from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
@@ -86,8 +92,11 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
         notes=True,
     )
     chosen = report = _report(check)
+    processes = ""
     if choice.env is not None:
-        spec = choice.spec(default_settings(report.spaces, [*environment.leave_out, *report.constant_texts]))
+        defaults = default_settings(report.spaces, [*environment.leave_out, *report.constant_texts])
+        defaults, processes = with_measured_processes(choice.spec, defaults, report)
+        spec = choice.spec(defaults)
         if spec.environment != environment and report.spaces is not None:
             chosen = _report(replace(check, spec=spec.environment, seconds=0.0, notes=False))
     network, fault = _network(spec, chosen.spaces, modules)
@@ -96,7 +105,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
         *_description(spec, report),
         *(_choices(spec, network) if chosen.spaces is not None else ()),
         *(("warning", text) for text in report.warnings),
-        *(("note", text) for text in (*report.notes, *_advice(spec, report))),
+        *(("note", text) for text in filter(None, (*report.notes, processes, *_advice(spec, report)))),
         *([("problem", with_preset(text, spec)) for text in problems] or [("result", _result(report))]),
     ]
 

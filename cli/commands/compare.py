@@ -12,12 +12,12 @@ from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\
-Compares finished runs of one environment. Runs with equal settings apart from the seed are one group, which is named
-after the settings in which they differ; or you name the groups, with `--` between them. The table shows the final
-return, env_steps and minutes until the mean return of the training episodes reached a threshold, and the probability
-that a run is better than one of the first group. Where training plays another task than evaluations
+Compares finished runs, in one table for each environment. Runs with equal settings apart from the seed are one group,
+which is named after the settings in which they differ; or you name the groups, with `--` between them. A table shows
+the final return, env_steps and minutes until the mean return of the training episodes reached a threshold, and the
+probability that a run is better than one of the first group. Where training plays another task than evaluations
 (environment.training_kwargs, environment.no_reward_limit), evaluations have to reach the threshold. A folder of run
-directories stands for all of them."""
+directories stands for all of them. Runs that are left out have a line with the reason."""
 
 _EXAMPLES = """\
 examples:
@@ -52,19 +52,19 @@ def compare(arguments: list[str]) -> int:
     """Run `daedalus compare` and return its exit status: 0 done, 1 failed."""
     parsed, parts = parse_groups(parser(), arguments)
     try:
-        groups, problems = select(parts, finished=True, columns=[SECONDS])
+        environments, problems = select(parts, finished=True, columns=[SECONDS])
         for problem in problems:
             print_error("compare", problem)
-        comparison = compare_groups(groups, parsed.threshold)
+        comparisons = [compare_groups(groups, parsed.threshold) for groups in environments]
         if parsed.csv is not None:
-            parsed.csv.write_text(as_csv(comparison), "utf-8", newline="")
+            parsed.csv.write_text(as_csv(comparisons), "utf-8", newline="")
     except RunDataError as error:
         print_error("compare", error)
         return 1
     except OSError as error:
         print_error("compare", f"{parsed.csv}: {error.strerror}")
         return 1
-    say(as_text(comparison))
+    say(as_text(comparisons))
     return 0
 
 

@@ -16,9 +16,9 @@ from daedalus.policy.saving.regular_files import replace_text
 _DESCRIPTION = """\
 Writes one HTML file about a run: settings, curves, statistics and a histogram of the evaluation, a video if there is
 one in the run directory, versions, and what failed meanwhile. Of several runs, the file shows a table and the curves
-together: runs with equal settings apart from the seed are one curve; or you name the runs of each curve, with `--`
-between them. A folder of run directories stands for all of them. The file loads nothing from other hosts and runs no
-script: you can send it to others."""
+together, for each environment: runs with equal settings apart from the seed are one curve; or you name the runs of each
+curve, with `--` between them. A folder of run directories stands for all of them. The file loads nothing from other
+hosts and runs no script: you can send it to others."""
 
 _EXAMPLES = """\
 examples:
@@ -62,13 +62,14 @@ def report(arguments: list[str]) -> int:
     """Run `daedalus report` and return its exit status: 0 done, 1 failed."""
     parsed, parts = parse_groups(parser(), arguments)
     try:
-        groups, problems = select(parts, finished=False, columns=[SECONDS], read=read_record)
+        environments, problems = select(parts, finished=False, columns=[SECONDS], read=read_record)
         for problem in problems:
             print_error("report", problem)
+        groups = [group for groups in environments for group in groups]
         if len(groups) == 1 and len(groups[0].runs) == 1 and not problems:
             page, output = run_page(groups[0], parsed.by), parsed.output or groups[0].runs[0].directory / _NAME
         else:
-            page = comparison_page(groups, parsed.by, threshold=parsed.threshold, left_out=problems)
+            page = comparison_page(environments, parsed.by, threshold=parsed.threshold, left_out=problems)
             output = parsed.output or Path(_NAME)
     except RunDataError as error:
         print_error("report", error)

@@ -3,19 +3,25 @@
 import argparse
 import logging
 import math
+import threading
 
 from daedalus.cli.arguments import add_insecure, add_logging, add_tls, command_parser
 from daedalus.launch.logs import configure_logging, print_error
 from daedalus.launch.process_lifecycle import raise_descriptor_limit, status_at_start, stop_on_signals
 from daedalus.transport.addresses import check_connecting, reachable
 from daedalus.transport.connecting import listen
-from daedalus.transport.credentials import SECURITY_ERRORS, CredentialsError, credentials_to_listen
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, CredentialsError, credentials_to_listen
 from daedalus.transport.interface import TransportError
+from daedalus.transport.zenoh_session import diagnose_connection
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
+from daedalus.transport.zenoh_transport import ZenohTransport
 
 _logger = logging.getLogger(__name__)
 
 LISTEN = "tcp/127.0.0.1:7447"
+
+_FIRST_LOOK_SECONDS, _LOOK_SECONDS = 3.0, 15.0  # at the connections to other routers
+_RETRY_SECONDS = 1.5  # more than Zenoh waits between two attempts
 
 _DESCRIPTION = """\
 Forwards the traffic between a learner and its actors. With a router of its own, a learner can restart or move to
@@ -86,15 +92,37 @@ def router(arguments: list[str]) -> int:
     raise_descriptor_limit()
     stop = stop_on_signals()
     try:
-        hosts = credentials.hosts() if credentials else ()
+        hosts = credentials.hosts() if credentials else []
         limit = int(parsed.max_message_megabytes * 2**20)
         transport = listen([parsed.listen], parsed.connect, credentials, max_message_bytes=limit)
     except (TransportError, CredentialsError) as error:
         print_error("router", error)
         return 1
     try:
-        _logger.info("listening on %s", " and ".join(reachable([parsed.listen], hosts)))
+        if credentials is None:
+            _logger.info("listening on %s", " and ".join(reachable([parsed.listen])))
+        else:
+            _logger.info("listening on %s; the certificate is for %s", parsed.listen, ", ".join(hosts))
+        _log_unreached(transport, parsed.connect, credentials, stop)
         stop.wait()
     finally:
         transport.close()
     return 0
+
+
+def _log_unreached(
+    transport: ZenohTransport, others: list[str], credentials: Credentials | None, stop: threading.Event
+) -> None:
+    """Log which of the other routers cannot be reached and why, until `stop` is set: Zenoh keeps trying in silence."""
+    logged, pause = "", _FIRST_LOOK_SECONDS
+    while others and not stop.wait(pause):
+        reasons = {each: diagnose_connection(each, credentials).reason for each in transport.unreached(others)}
+        if reasons and stop.wait(_RETRY_SECONDS):
+            return
+        still = transport.unreached(list(reasons))  # others were about to be reached
+        text = "; ".join(reasons[each] for each in still)
+        if text and text != logged:
+            _logger.warning("%s; trying again", text)
+        elif logged and not text:
+            _logger.info("connected to %s", " and ".join(others))
+        logged, pause = text, _LOOK_SECONDS

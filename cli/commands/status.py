@@ -3,10 +3,11 @@
 import argparse
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from textwrap import TextWrapper
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.run_watcher import looks
@@ -19,14 +20,17 @@ from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
-from daedalus.protocol.texts import one_line, printable, short_number
-from daedalus.transport.connecting import connect_until_interrupted
+from daedalus.protocol.texts import one_line, policy_lag, printable, short_number
+from daedalus.transport.connecting import connect_once
 from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.status_query import ask, ask_events, no_answer
+from daedalus.transport.status_query import ask, ask_events, no_answer, waiting_actors
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
+_MOST_WAITING = 20  # names of actors that wait for a run
 _FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0  # between two looks
+_WIDTH = 100  # characters of a line of the state
+_WRAPPER = TextWrapper(_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
 
 _DESCRIPTION = """\
 Shows the state of the learners at an address and of their actors. The exit status serves as a health check: a learner
@@ -41,8 +45,9 @@ examples:
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
-epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts rollouts, MB/h down
-counts snapshots. An s marks an actor that fetches compact snapshots.
+lag is how old the policy of an actor's newest rollout was: the actors play while the learner trains, so one or two
+batches are normal. epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts
+rollouts, down counts snapshots. A c marks an actor that fetches compact snapshots.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
 0 alive, not begun or ended, 1 not alive or no run directory"""
@@ -95,24 +100,27 @@ def status(arguments: list[str]) -> int:
     try:
         if parsed.watch:
             return _watch(parsed, credentials)
-        transport = connect_until_interrupted(parsed.connect, credentials)
+        transport = connect_once(parsed.connect, credentials)
         try:
             statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
             unanswered = "" if statuses else no_answer(transport, parsed.run)
+            waiting = list(waiting_actors(transport))
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
         print_error("status", error)
         return NO_ANSWER
     if not statuses:
-        print_error("status", unanswered)
+        print_error("status", f"{unanswered}{_waiting(waiting)}")
         return NO_ANSWER
     if parsed.quiet:
         _show_problems(statuses)
     else:
         for shown in filter(None, pages) if parsed.events else statuses:
-            say(_json(shown) if parsed.json else _text(shown))
+            say(_json(shown, waiting) if parsed.json else _text(shown))
+        if waiting and not (parsed.json or parsed.events):
+            say(_waiting(waiting).removeprefix("; "))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
 
 
@@ -120,7 +128,7 @@ def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
     screen = Screen()
     frames = screen.shows_frames and not parsed.json
     shown = _json if parsed.json else _text
-    connect = partial(connect_until_interrupted, parsed.connect, credentials)
+    connect = partial(connect_once, parsed.connect, credentials)
     watch_status(connect, parsed.run, screen, shown, frames=frames)
     return HEALTHY
 
@@ -140,19 +148,32 @@ def watch_status(
     Raises TransportError if the learner refuses this process, or if its answers are damaged.
     """
     wanted = "no learner" if run == keys.ANY_RUN else f"no learner of run {run!r}"
-    nobody, waiting = f"{wanted} answers at this address; waiting for one (Ctrl-C ends)", False
+    nobody = f"{wanted} answers at this address"
+    reason, said = nobody, ""  # why no run is shown, and what the user has read of it
+
+    def open_transport() -> Transport:
+        nonlocal reason
+        try:
+            transport = connect()
+        except TransportError as error:
+            reason = str(error)
+            raise
+        reason = nobody
+        return transport
+
     with suppress(KeyboardInterrupt):
         try:
-            for runs in looks(connect, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+            for runs in looks(open_transport, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+                waiting = "" if runs else f"{reason}; waiting for one (Ctrl-C ends)"
                 if frames and runs:
                     screen.show(runs)
                 elif frames:
-                    screen.say(nobody)
-                elif not runs and not waiting:
-                    screen.err(f"daedalus status: {nobody}")
+                    screen.say(waiting)
+                elif waiting and waiting != said:
+                    screen.err(f"daedalus status: {waiting}")
                 for each in runs if not frames else ():
                     screen.out(text(each.status))
-                waiting = not runs
+                said = waiting
         finally:
             screen.end()
 
@@ -181,15 +202,28 @@ def _show_problems(statuses: list[RunStatus]) -> None:
             say(one_line(f"{status.run}: {problem}"))
 
 
-def _json(shown: RunStatus | EventsPage) -> str:
-    """Return JSON in ASCII: texts of peers cannot command a terminal."""
-    return json.dumps(shown.model_dump(mode="json"))
+def _json(shown: RunStatus | EventsPage, waiting: Sequence[str] = ()) -> str:
+    """Return JSON in ASCII: texts of peers cannot command a terminal. `waiting` are actors that wait for a run."""
+    more = {"waiting_actors": list(waiting)} if isinstance(shown, RunStatus) else {}
+    return json.dumps({**shown.model_dump(mode="json"), **more})
+
+
+def _waiting(names: Sequence[str]) -> str:
+    """Return which actors wait for a run, as the end of a sentence."""
+    if not names:
+        return ""
+    more = f" and {len(names) - _MOST_WAITING:,} more" if len(names) > _MOST_WAITING else ""
+    actors = "1 actor waits" if len(names) == 1 else f"{len(names):,} actors wait"
+    return f"; {actors} for a run: {', '.join(names[:_MOST_WAITING])}{more}"
 
 
 def _text(shown: RunStatus | EventsPage) -> str:
     """Return what a person reads; texts of peers can neither begin a line nor command a terminal."""
     lines = _events(shown) if isinstance(shown, EventsPage) else _table(shown)
-    return "\n".join(printable(line.replace("\n", " ")) for line in lines)
+    lines = [printable(line.replace("\n", " ")) for line in lines]
+    if isinstance(shown, RunStatus):
+        lines = [part for line in lines for part in ([line] if len(line) <= _WIDTH else _WRAPPER.wrap(line))]
+    return "\n".join(lines)
 
 
 def _events(page: EventsPage) -> list[str]:
@@ -215,19 +249,88 @@ def _table(status: RunStatus) -> list[str]:
         f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}, "
         f"updates {status.updates:,}{skipped}",
         f"  {status.env_steps_per_second:,.0f} env_steps/s, {status.updates_per_second:,.1f} updates/s, "
-        f"policy lag {status.policy_lag_mean:.1f}",
+        f"policy lag {policy_lag(status.policy_lag_mean, status.updates_per_batch)}",
         f"  actors: {status.actors_alive:,} alive, {status.actors_quarantined:,} quarantined, {status.actors_gone:,} "
         f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
-        f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'epsilon':>7} {'env_steps':>13} {'/s':>8}"
-        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}"
-        "  rejected; host, address, software",
-        *(f"  {_line(actor)}" for actor in status.actors),
+        *([f"  last order at {status.last_order}"] if status.last_order else []),
+        *_actor_table(status),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
-        *(f"  {actor.actor} {text}" for actor in status.actors for text in _client_texts(actor)),
+        *(f"  {actor.actor} {text}" for actor in status.actors for text in _actor_texts(actor)),
+        *_places(status.actors),
         *map(_refused, status.refused_joins),
+    ]
+
+
+_Cell = Callable[[ActorStatus, RunStatus], str]
+# Columns of the table of actors, each with its cell. A column in which no actor has anything is left out: "-" or "".
+_COLUMNS: dict[str, _Cell] = {
+    "actor": lambda actor, _: printable(actor.actor),
+    "state": lambda actor, _: _state(actor),
+    "seen": lambda actor, _: f"{actor.seconds_since_seen:.1f} s",
+    "lives": lambda actor, _: f"{actor.lives}" if actor.lives > 1 else "-",
+    "envs": lambda actor, _: f"{actor.environments}",
+    "epsilon": lambda actor, _: f"{actor.epsilon:g}" if actor.epsilon else "-",
+    "env_steps": lambda actor, _: f"{actor.env_steps:,}",
+    "/s": lambda actor, _: f"{actor.env_steps_per_second:,.0f}",
+    "lag": lambda actor, run: policy_lag(actor.policy_lag, run.updates_per_batch).partition(" (")[0],
+    "busy": lambda actor, _: f"{_busy_share(actor):.0%}",
+    "accepted": lambda actor, _: f"{actor.rollouts_accepted:,}",
+    "missed": lambda actor, _: f"{actor.rollouts_missed:,}" if actor.rollouts_missed else "-",
+    "MB/h up": lambda actor, _: f"{actor.bytes_up_per_hour / 1e6:,.0f}",
+    "down": lambda actor, _: f"{actor.bytes_down_per_hour / 1e6:,.0f}{'c' if actor.compact_snapshots else ''}",
+}
+_LEFT = ("actor", "state")  # columns of words
+_LEAST_IMPORTANT = ("down", "MB/h up", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy")
+
+
+def _state(actor: ActorStatus) -> str:
+    if actor.quarantined:
+        return "quarantined"
+    return "gone" if not actor.alive else "leaving" if actor.drained_by else "alive"
+
+
+def _actor_table(status: RunStatus) -> list[str]:
+    """Return the table of the actors, with as many columns as fit, and which do not."""
+    columns = {name: [cell(actor, status) for actor in status.actors] for name, cell in _COLUMNS.items()}
+    columns = {name: cells for name, cells in columns.items() if not set(cells) <= {"-"}}
+    dropped = []
+    for name in _LEAST_IMPORTANT:
+        if sum(2 + max(map(len, (name, *cells))) for name, cells in columns.items()) <= _WIDTH:
+            break
+        dropped += [name] if columns.pop(name, None) else []
+    rows = []
+    for row in zip(*((name, *cells) for name, cells in columns.items()), strict=True):
+        cells = []
+        for text, (name, others) in zip(row, columns.items(), strict=True):
+            width = max(map(len, (name, *others)))
+            cells.append(text.ljust(width) if name in _LEFT else text.rjust(width))
+        rows.append(f"  {'  '.join(cells)}")
+    return [*rows, *([f"  --json has more columns: {', '.join(dropped)}"] if dropped else [])]
+
+
+def _busy_share(actor: ActorStatus) -> float:
+    answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
+    return actor.busy_answers / max(answers, 1)
+
+
+def _actor_texts(actor: ActorStatus) -> list[str]:
+    rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
+    drained = [f"leaves: drained by {actor.drained_by}"] if actor.drained_by and actor.alive else []
+    return [*drained, *([f"rejected: {rejected}"] if rejected else []), *_client_texts(actor)]
+
+
+def _places(actors: Sequence[ActorStatus]) -> list[str]:
+    """Return which actors run at which host, under which release, and at which address."""
+    by_host: dict[tuple[str, str], list[str]] = {}
+    for actor in actors:
+        address = f" ({actor.address})" if actor.address else ""
+        by_host.setdefault((actor.host, actor.software), []).append(f"{actor.actor}{address}")
+    return [
+        f"  on {host or 'an unknown host'}{f', {software}' if software else ''}: {', '.join(names)}"
+        for (host, software), names in by_host.items()
     ]
 
 
@@ -264,18 +367,3 @@ def _expiry(days: float | None) -> list[str]:
 def _missing_actors(status: RunStatus) -> list[str]:
     missing = status.fleet_size - len(status.actors)
     return [f"  ... and {missing:,} more, which the learner did not report in time"] if missing > 0 else []
-
-
-def _line(actor: ActorStatus) -> str:
-    state = "quarantined" if actor.quarantined else "alive" if actor.alive else "gone"
-    rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
-    answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
-    down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.compact_snapshots else ''}"
-    where = ", ".join(filter(None, (actor.host, actor.address, actor.software)))
-    epsilon = f"{actor.epsilon:g}" if actor.epsilon else "-"
-    return (
-        f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
-        f" {epsilon:>7} {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
-        f" {actor.busy_answers / max(answers, 1):>5.0%} {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
-        f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}; {where or '-'}"
-    )

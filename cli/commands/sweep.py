@@ -158,7 +158,7 @@ def _planner(parsed: argparse.Namespace, folder: Path) -> tuple[Planner, range]:
     if choice.env is None:
         checked_spaces(choice.spec(), fork=True)
     else:
-        _, defaults = checked_defaults(choice.spec(), fork=True)
+        _, defaults = checked_defaults(choice.spec, fork=True)
     first = choice.spec(defaults).training.seed
     return Planner(choice, parsed.log, folder, defaults), range(first, first + parsed.seeds)
 

@@ -291,8 +291,9 @@ def _run(run: LocalRun, screen: Screen, *, exits_with_parent: bool) -> int:
     try:
         with output:
             end = run_locally(run, stopping, output, output.unlimited_pipes if live else inherited)
-    except RunStoppedError:
-        say(f"stopped; continue with: {resume_command(run)}")
+    except RunStoppedError as error:
+        by = f" by {error}" if str(error) else ""
+        say(f"stopped{by}; continue with: {resume_command(run)}")
         return 1
     except RunFailedError as error:
         if str(error):

@@ -1,7 +1,7 @@
 // The actors of the run: totals, hosts, and a table that is filtered and sorted.
 
 import { byId, setText } from "./dom.js";
-import { counted, number, percent, whole } from "./format.js";
+import { counted, number, percent, policyLag, whole } from "./format.js";
 import { Table } from "./table.js";
 
 const MANY = 50; // actors, from which on the hosts are shown too
@@ -19,16 +19,18 @@ const busyShare = (actor) => actor.busy_answers / Math.max(actor.busy_answers + 
 const byCause = (actor) => Object.entries(actor.rollouts_rejected).sort().map(([cause, count]) => `${whole(count)} ${cause}`).join(", ");
 const remarks = (actor) => [byCause(actor), actor.quarantined && `quarantined: ${actor.quarantined}`].filter(Boolean).join("; ");
 
+const lagOf = (row) => policyLag(row.policy_lag, row.updates_per_batch)[0];
+
 const COLUMNS = [
   { name: "actor", title: "Actor", text: (row) => row.actor },
   { name: "state", title: "State", text: (row) => row.state, style: (row) => (row.state === "quarantined" ? "bad" : "") },
   { name: "host", title: "Host", text: (row) => row.host || "-" },
   { name: "rate", title: "env_steps/s", number: true, text: (row) => number(row.env_steps_per_second), value: (row) => row.env_steps_per_second },
   { name: "steps", title: "env_steps", number: true, text: (row) => whole(row.env_steps), value: (row) => row.env_steps },
-  { name: "lag", title: "Lag", number: true, text: (row) => whole(row.policy_lag), value: (row) => row.policy_lag },
+  { name: "lag", title: "Lag", number: true, text: lagOf, value: (row) => row.policy_lag },
   { name: "busy", title: "Busy", number: true, text: (row) => percent(busyShare(row)), value: busyShare },
   { name: "seen", title: "Seen", number: true, text: (row) => `${number(row.seconds_since_seen, 2)} s`, value: (row) => row.seconds_since_seen },
-  { name: "link", title: "Link", text: (row) => (row.compact_snapshots ? "slow" : "-"), style: (row) => (row.compact_snapshots ? "warn" : "") },
+  { name: "snapshots", title: "Snapshots", text: (row) => (row.compact_snapshots ? "compact" : "whole") },
   { name: "rejected", title: "Rejected", wraps: true, text: (row) => remarks(row) || "-", value: rejections, style: (row) => (row.quarantined ? "bad" : "") },
 ];
 const HOST_COLUMNS = [
@@ -36,7 +38,7 @@ const HOST_COLUMNS = [
   { name: "actors", title: "Actors", number: true, text: (row) => whole(row.actors), value: (row) => row.actors },
   { name: "absent", title: "Gone or quarantined", number: true, text: (row) => whole(row.absent), value: (row) => row.absent },
   { name: "rate", title: "env_steps/s", number: true, text: (row) => number(row.rate), value: (row) => row.rate },
-  { name: "lag", title: "Highest lag", number: true, text: (row) => whole(row.lag), value: (row) => row.lag },
+  { name: "lag", title: "Highest lag", number: true, text: lagOf, value: (row) => row.policy_lag },
   { name: "rejected", title: "Rejected", number: true, text: (row) => whole(row.rejected), value: (row) => row.rejected },
 ];
 
@@ -46,6 +48,7 @@ export class Fleet {
   #actors = [];
   #extra = [];
   #count = 0;
+  #updatesPerBatch = 1;
   #filter = byId("filter");
   #table = new Table("Actors", ["actor", 1]);
   #hosts = new Table("Hosts", ["actors", -1]);
@@ -68,6 +71,7 @@ export class Fleet {
   /** Note how many actors the run has: the table may have fewer. */
   count(status) {
     this.#count = status === null ? 0 : status.actors_alive + status.actors_quarantined + status.actors_gone;
+    this.#updatesPerBatch = status?.updates_per_batch ?? 1;
   }
 
   #draw() {
@@ -76,7 +80,7 @@ export class Fleet {
       const text = `${actor} ${host} ${state} ${address} ${software}`.toLowerCase();
       return words.every((word) => text.includes(word));
     };
-    const chosen = this.#actors.filter(matches);
+    const chosen = this.#actors.filter(matches).map((actor) => ({ ...actor, updates_per_batch: this.#updatesPerBatch }));
     setText(byId("totals"), this.#totals(chosen, words.length > 0));
     byId("hosts").replaceChildren(...(this.#actors.length > MANY ? [this.#hosts.root] : []));
     if (this.#actors.length > MANY) this.#hosts.show(complete(HOST_COLUMNS), hostsOf(chosen));
@@ -99,11 +103,11 @@ function hostsOf(actors) {
   const hosts = new Map();
   for (const actor of actors) {
     const name = actor.host || "unknown";
-    const host = hosts.get(name) ?? { host: name, actors: 0, absent: 0, rate: 0, lag: 0, rejected: 0 };
+    const host = hosts.get(name) ?? { host: name, actors: 0, absent: 0, rate: 0, policy_lag: 0, updates_per_batch: actor.updates_per_batch, rejected: 0 };
     host.actors += 1;
     host.absent += actor.state === "alive" ? 0 : 1;
     host.rate += actor.env_steps_per_second;
-    host.lag = Math.max(host.lag, actor.policy_lag);
+    host.policy_lag = Math.max(host.policy_lag, actor.policy_lag);
     host.rejected += rejections(actor);
     hosts.set(name, host);
   }

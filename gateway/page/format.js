@@ -37,3 +37,14 @@ export function percent(share) {
 export function counted(count, noun) {
   return `${whole(count)} ${noun}${count === 1 ? "" : "s"}`;
 }
+
+/** Return a policy lag, and the same in updates or an empty text: a batch may make many updates. */
+export function policyLag(updates, updatesPerBatch) {
+  const counts = [updates, updates / updatesPerBatch].map((count) => Math.round(count * 10) / 10);
+  const [inUpdates, inBatches] = [decimal(counts[0], "update"), decimal(counts[1], "batch", "batches")];
+  return updatesPerBatch === 1 ? [inUpdates, ""] : [inBatches, inUpdates];
+}
+
+function decimal(count, noun, several = `${noun}s`) {
+  return `${number(count)} ${count === 1 ? noun : several}`;
+}

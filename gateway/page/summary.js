@@ -1,7 +1,7 @@
 // The run in a few figures, and how it is.
 
 import { byId, element, setText } from "./dom.js";
-import { counted, duration, number, percent, whole } from "./format.js";
+import { counted, duration, number, percent, policyLag, whole } from "./format.js";
 
 const STATES = {
   connecting: "connecting to the network",
@@ -92,7 +92,8 @@ export class Summary {
       evaluated === null ? "none yet" : `± ${number(metrics.newest("evaluation_return_std"))} at ${number(evaluated)} env_steps`,
     );
     this.#tile("env_steps/s", number(status.env_steps_per_second), `${number(status.updates_per_second)} updates/s`);
-    this.#tile("Policy lag", number(status.policy_lag_mean), "updates, mean of the last second");
+    const [lag, inUpdates] = policyLag(status.policy_lag_mean, status.updates_per_batch);
+    this.#tile("Policy lag", lag, `${inUpdates ? `${inUpdates}, ` : ""}mean of the last second`);
     const absent = [[status.actors_quarantined, "quarantined"], [status.actors_gone, "gone"]];
     const others = absent.filter(([count]) => count).map(([count, what]) => `${whole(count)} ${what}`);
     this.#tile("Actors", whole(status.actors_alive), others.join(", ") || "none gone");

@@ -4,18 +4,10 @@ from collections.abc import Callable
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, METRICS_LIMITS
-from daedalus.protocol.messages import (
-    Acknowledgement,
-    EventsPage,
-    MetricsReport,
-    MetricsRequest,
-    Order,
-    OrderRequest,
-    Refusal,
-    RunStatus,
-)
+from daedalus.protocol.limits import METRICS_LIMITS
+from daedalus.protocol.messages import EventsPage, MetricsReport, MetricsRequest, Order, RunStatus
 from daedalus.transport.interface import Transport
+from daedalus.transport.operator_orders import UNNAMED, Operator, OrderError
 from daedalus.transport.status_query import ask, ask_events, decoded, newest_of_each_run
 
 _ANSWER_SECONDS = 5.0
@@ -24,15 +16,22 @@ _ANSWER_SECONDS = 5.0
 class LearnerSource:
     """A RunSource over a transport (gateway/watching/page_data.py)."""
 
-    def __init__(self, transport: Transport, run: str = keys.ANY_RUN, chosen: Callable[[], str] = lambda: "") -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        run: str = keys.ANY_RUN,
+        chosen: Callable[[], str] = lambda: "",
+        operator: Operator = UNNAMED,
+    ) -> None:
         """Construct the source.
 
         Args:
           transport: the network.
           run: name of the run, or `*`.
           chosen: returns the run to prefer if several learners answer; empty if there is no preference.
+          operator: gives the orders.
         """
-        self._transport, self._run, self._chosen = transport, run, chosen
+        self._transport, self._run, self._chosen, self._operator = transport, run, chosen, operator
 
     def status(self, max_actors: int) -> RunStatus | None:
         """See RunSource."""
@@ -53,12 +52,9 @@ class LearnerSource:
                 return report
         return None
 
-    def order(self, status: RunStatus, order: Order) -> tuple[bool, str]:
+    def order(self, status: RunStatus, order: Order, token: str) -> tuple[bool, str]:
         """See RunSource."""
-        request = encode(OrderRequest(order=order))
-        answers = self._transport.query(keys.orders(status.run), request, timeout=_ANSWER_SECONDS)
-        for accepted in decoded(answers, Acknowledgement, ACKNOWLEDGEMENT_LIMITS):
-            return True, accepted.reason
-        for refusal in decoded(answers, Refusal, ACKNOWLEDGEMENT_LIMITS):
-            return False, refusal.reason
-        return False, "the learner does not answer: try again later"
+        try:
+            return True, self._operator.with_token(token).give(self._transport, status, order)
+        except OrderError as error:
+            return False, str(error)

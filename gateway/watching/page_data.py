@@ -28,8 +28,11 @@ class RunSource(Protocol):
         """Return the rows from number `first` on, as many as one answer has; None without an answer."""
         ...
 
-    def order(self, status: RunStatus, order: Order) -> tuple[bool, str]:
-        """Give an order; return whether it is accepted, and what came of it or why it is not."""
+    def order(self, status: RunStatus, order: Order, token: str) -> tuple[bool, str]:
+        """Give an order; return whether it is accepted, and what came of it or why it is not.
+
+        `token` says whose token the page sent.
+        """
         ...
 
 
@@ -109,7 +112,7 @@ def _short(value: Any) -> Any:
 MAX_VIEWERS = 32
 _OPERATORS = 4  # further pages, for operators
 
-GiveOrder = Callable[[Order], tuple[bool, str]]  # waits for the learner, as RunSource.order
+GiveOrder = Callable[[Order, str], tuple[bool, str]]  # waits for the learner, as RunSource.order
 
 
 class Camera(Protocol):
@@ -120,7 +123,7 @@ class Camera(Protocol):
         ...
 
 
-def _nobody(order: Order) -> tuple[bool, str]:
+def _nobody(order: Order, token: str) -> tuple[bool, str]:
     return False, "the learner was not reached yet: try again later"
 
 

@@ -231,9 +231,9 @@ class ViewerConnection:
     async def _answer(self, message: ViewerMessage) -> None:
         match message:
             case ViewerOrder():
-                self._guard.check_operator(message.token)
-                _logger.info("a page orders: %s", message.order)
-                accepted, result = await asyncio.to_thread(self._data.give_order, message.order)
+                owner = self._guard.check_operator(message.token)
+                _logger.info("a page with the token of %s orders: %s", owner, message.order)
+                accepted, result = await asyncio.to_thread(self._data.give_order, message.order, owner)
                 if not accepted:
                     raise ClientError("unavailable", result)
                 await self._send({"type": "ordered", "order": message.order, "result": result})

@@ -3,19 +3,25 @@
 import csv
 import errno
 import io
+import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import compress, islice
 from pathlib import Path
 
 import numpy as np
 
+from daedalus.learner.reporting import thinning
 from daedalus.learner.reporting.metrics_rows import COLUMNS, Details, lasting, numbers
+from daedalus.learner.reporting.thinning import bounded, line_bytes
 from daedalus.policy.saving.regular_files import append_own, replacing
 from daedalus.protocol.texts import exact_number
 
 _BLOCK_BYTES = 1 << 16
+
+_logger = logging.getLogger(__name__)
 
 
 class CsvWriter:
@@ -23,14 +29,17 @@ class CsvWriter:
 
     Lines are complete: one that was written in part, because the disk was full or the machine crashed, is removed. A
     row with new columns, such as the first scalar of the environment's info, adds them to the header, for which the
-    file is written anew.
+    file is written anew. So it is when it has more than MAX_BYTES, with its old rows merged.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        for beside in path.parent.glob(f".{path.name}.*.partial"):  # of a process that was killed meanwhile
+            beside.unlink(missing_ok=True)
         _remove_partial_line(path)
         self._columns = _header(path)  # another release may have had other columns
         self._file = append_own(path)
+        self._thin_at = thinning.MAX_BYTES
         if not self._columns:
             self._append(COLUMNS)
             self._columns = COLUMNS
@@ -42,10 +51,15 @@ class CsvWriter:
         if new:
             self._add_columns(new)
         self._append([exact_number(row.get(name)) for name in self._columns])
+        if self._size() > self._thin_at:
+            self._thin()
+
+    def _size(self) -> int:
+        return os.fstat(self._file.fileno()).st_size
 
     def _append(self, cells: Sequence[str]) -> None:
         data = _line(cells)
-        before = os.fstat(self._file.fileno()).st_size
+        before = self._size()
         try:
             written = self._file.write(data)
             if written != len(data):
@@ -57,15 +71,24 @@ class CsvWriter:
     def _add_columns(self, names: Sequence[str]) -> None:
         """Write the file anew with further columns, which are blank in the rows so far."""
         columns = (*self._columns, *names)
-        rows = _rows(self._path)
-        next(rows)
-        with replacing(self._path) as beside, open(beside, "wb") as new:
-            new.write(_line(columns))
-            for cells in rows:
-                new.write(_line([*cells, *[""] * len(names)]))
+        rows = islice(_rows(self._path), 1, None)
+        _rewrite(self._path, columns, ([*cells, *[""] * len(names)] for cells in rows))
+        self._reopen()
+        self._columns = columns
+
+    def _thin(self) -> None:
+        """Write the file anew with its old rows merged. It stays as it is if the disk has no room for that."""
+        try:
+            thin_file(self._path)
+        except OSError as error:
+            _logger.warning("old rows of %s are not merged yet: %s", self._path.name, error.strerror)
+        self._reopen()
+        self._thin_at = max(thinning.MAX_BYTES, self._size() + thinning.MAX_BYTES // 4)
+
+    def _reopen(self) -> None:
+        """Continue the file that has taken the place of the open one."""
         self._file.close()
         self._file = append_own(self._path)
-        self._columns = columns
 
     def close(self) -> None:
         """Close the file. See MetricsWriter."""
@@ -75,21 +98,54 @@ class CsvWriter:
 def cut_rows(path: Path, env_steps: int) -> list[dict[str, float]]:
     """Remove the rows that a run undoes when it continues at `env_steps`, and return them; and those undone before.
 
-    Raises OSError.
+    A file of an earlier release, which may be of any size, is thinned too. Raises OSError.
     """
     if not path.exists():
         return []
     _remove_partial_line(path)
     columns = list(_header(path))
-    read = [numbers(columns, list(cells)) for cells in islice(_rows(path), 1, None)]
-    steps, seconds = (np.array([row.get(name, np.nan) for row in read]) for name in ("env_steps", "wall_seconds"))
-    newest, undone = lasting(steps, seconds), steps > env_steps
-    kept = newest & ~undone
+    found = array("d")  # env_steps and wall_seconds
+    for cells in islice(_rows(path), 1, None):
+        found.extend(_values(("env_steps", "wall_seconds"), columns, cells))
+    steps, seconds = np.frombuffer(found).reshape(-1, 2).T
+    kept, undone = lasting(steps, seconds), steps > env_steps
+    removed = compress(islice(_rows(path), 1, None), kept & undone)
+    rows = [numbers(columns, list(cells)) for cells in removed]
+    kept &= ~undone
     if not kept.all():
-        with replacing(path) as beside, open(beside, "wb") as new:
-            new.write(_line(columns))
-            new.writelines(_line(cells) for cells in compress(islice(_rows(path), 1, None), kept))
-    return list(compress(read, newest & undone))
+        _rewrite(path, columns, compress(islice(_rows(path), 1, None), kept))
+    thin_file(path)
+    return rows
+
+
+def thin_file(path: Path) -> None:
+    """Merge old rows of a metrics.csv that has more than MAX_BYTES. Raises OSError: then the file is as it was."""
+    before = path.stat().st_size
+    if before <= thinning.MAX_BYTES:
+        return
+    columns = list(_header(path))
+    rows = ((line_bytes(cells), _values(columns, columns, cells)) for cells in islice(_rows(path), 1, None))
+    values = bounded(columns, rows).tolist()
+    _rewrite(path, columns, ([exact_number(None if cell != cell else cell) for cell in row] for row in values))
+    _logger.info(
+        "%s had %.0f MiB and has %.1f MiB: old rows are merged, the newest are as they were",
+        *(path.name, before / 2**20, path.stat().st_size / 2**20),
+    )
+
+
+def _values(names: Sequence[str], columns: list[str], cells: Sequence[str]) -> list[float]:
+    """Return the values of some columns of a line; NaN: no value."""
+    row = numbers(columns, list(cells))
+    return [row.get(name, np.nan) for name in names]
+
+
+def _rewrite(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a file anew in one step, also if the machine crashes meanwhile. Raises OSError."""
+    with replacing(path) as beside, open(beside, "wb") as new:
+        new.write(_line(columns))
+        new.writelines(_line(cells) for cells in rows)
+        new.flush()
+        os.fsync(new.fileno())
 
 
 def _line(cells: Sequence[str]) -> bytes:

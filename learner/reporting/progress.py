@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import TextIO
 
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.texts import policy_lag, short_number
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
@@ -22,9 +22,9 @@ _logger = logging.getLogger(__name__)
 class Progress:
     """Display of the newest metrics row."""
 
-    def __init__(self, stream: TextIO, env_steps_budget: int) -> None:
+    def __init__(self, stream: TextIO, env_steps_budget: int, updates_per_batch: int = 1) -> None:
         self._stream = stream
-        self._budget = env_steps_budget
+        self._budget, self._updates_per_batch = env_steps_budget, updates_per_batch
         self._terminal = is_terminal(stream)
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
         self._rewriting = False
@@ -39,7 +39,7 @@ class Progress:
             if time.monotonic() < self._next_line:
                 return
             self._next_line = time.monotonic() + _LINE_SECONDS
-        parts = _parts(row, self._budget, rate)
+        parts = _parts(row, self._budget, rate, self._updates_per_batch)
         if self._terminal:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
             self._write(f"\r\x1b[K{line}")
@@ -91,9 +91,10 @@ def is_terminal(stream: TextIO) -> bool:
     return stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
 
 
-def _parts(row: Mapping[str, float], budget: int, rate: float) -> list[str]:
+def _parts(row: Mapping[str, float], budget: int, rate: float, updates_per_batch: int) -> list[str]:
     """Return the parts of a line, the most important first. What is not known yet is a dash."""
     mean = short_number(row["episode_return_mean"]) if "episode_return_mean" in row else "-"
+    lag = policy_lag(row["policy_lag_mean"], updates_per_batch) if "policy_lag_mean" in row else "-"
     left = duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
     parts = [
         f"{row['wall_seconds']:7.1f} s",
@@ -102,7 +103,7 @@ def _parts(row: Mapping[str, float], budget: int, rate: float) -> list[str]:
         f"{_number(rate or None, ',.0f'):>7}/s",
         f"left {left:>6}",
         f"updates {_number(row.get('updates_per_second'), ',.0f'):>5}/s",
-        f"lag {_number(row.get('policy_lag_mean'), '.1f')}",
+        f"lag {lag}",
         f"actors {row['actors']}",
     ]
     if "episode_length_mean" in row:

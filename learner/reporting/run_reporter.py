@@ -27,7 +27,8 @@ from daedalus.protocol.messages import RunStatus
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
 
-_DETAILS_SECONDS = 10.0  # between details: they take far more space than a row
+_DETAILS_SECONDS = 10.0  # between details: they take far more space than a row,
+_DETAILS = 100  # and in an old run their distance is this part of its age
 
 _logger = logging.getLogger(__name__)
 
@@ -173,7 +174,7 @@ class RunReporter:
         """Return the distributions and the picture that belong to a metrics row; most rows have none."""
         if now < self._details_at and not last:
             return Details()
-        self._details_at = now + _DETAILS_SECONDS
+        self._details_at = now + max(_DETAILS_SECONDS, self._context.wall_seconds(now) / _DETAILS)
         with self._context.lock:
             returns, lengths = list(self._counters.returns), list(self._counters.lengths)
         return Details(
@@ -217,9 +218,10 @@ class RunReporter:
             **totals(fleet),
             refused_joins=fleet.refused_joins.report(now),
             actors=page(fleet, "", now),
+            updates_per_batch=spec.training.updates_per_batch,
         )
 
-    def summary(self, *, finished: bool, now: float) -> dict[str, Any]:
+    def summary(self, *, finished: bool, now: float, stopped_by: str = "") -> dict[str, Any]:
         """Return the content of summary.json at the end of training. A final evaluation adds its results later.
 
         Its env_steps_per_second is over the training of this process.
@@ -232,6 +234,7 @@ class RunReporter:
             "seed": spec.training.seed,
             "solved": counters.seconds_to_target is not None,
             "finished": finished,
+            "stopped_by": stopped_by or None,
             "env_steps": counters.env_steps,
             "updates": counters.updates,
             "updates_skipped": counters.updates_skipped,
@@ -251,15 +254,18 @@ class RunReporter:
             "snapshots_published": counters.snapshots_published,
         }
 
-    def write_summary(self, *, finished: bool, ended: float, confirmation: dict[str, Any] | None) -> None:
+    def write_summary(
+        self, *, finished: bool, stopped_by: str, ended: float, confirmation: dict[str, Any] | None
+    ) -> None:
         """Write summary.json.
 
         Args:
           finished: whether the run is over, rather than stopped.
+          stopped_by: the operator or other cause that stopped the run; empty if it is over.
           ended: when training ended, on the monotonic clock, in seconds.
           confirmation: result of the new episodes that confirmed the target; None without them.
         """
-        content = self.summary(finished=finished, now=ended)
+        content = self.summary(finished=finished, now=ended, stopped_by=stopped_by)
         if confirmation is not None:
             content["confirmation"] = confirmation
             content["confirmation_return_mean"] = confirmation["return_mean"]

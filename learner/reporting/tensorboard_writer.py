@@ -13,8 +13,11 @@ from typing import Any
 import numpy as np
 
 from daedalus.learner.reporting.metrics_rows import Details, tag
+from daedalus.learner.reporting.thinning import merged
 from daedalus.policy.saving.regular_files import append_own
 
+_EVENTS = 2000  # the distance of events is this part of the age of the run, if that is longer than that of rows
+_MOST_WAITING = 100  # rows, before they are merged
 _BINS = 30  # of returns and lengths
 _MOST_BINS = 256  # of actions
 _SMALLEST_RANGE = 1e-12  # of values, relative to the largest: a float has few numbers within a smaller one
@@ -22,6 +25,9 @@ _SMALLEST_RANGE = 1e-12  # of values, relative to the largest: a float has few n
 
 class TensorBoardWriter:
     """Writer of scalars, histograms and images against env_steps.
+
+    The older the run, the rarer are its events, each with the rows since the one before merged: an event file can only
+    grow. Details are written at once.
 
     It uses TensorBoard's record writer, but not its event writer: the thread of the event writer dies when the disk is
     full, and waits for an hour after the clock is set back by an hour.
@@ -41,6 +47,9 @@ class TensorBoardWriter:
         self._histogram_proto: Any = vars(summary_pb2)["HistogramProto"]
         now = time.time()
         name = f"events.out.tfevents.{int(now):010d}.{socket.gethostname()}.{os.getpid()}.{next(self._numbers)}"
+        self._waiting: list[Mapping[str, float]] = []  # the rows since the last event
+        self._written: Mapping[str, float] = {}  # the row of the last event
+        self._due = 0.0  # when the next event is, in wall_seconds
         self._writer = RecordWriter(append_own(directory / name))
         try:
             self._add(self._event(wall_time=now, file_version="brain.Event:2"))
@@ -51,7 +60,17 @@ class TensorBoardWriter:
             raise
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
-        """Write one event. See MetricsWriter."""
+        """Write one event if it is due. See MetricsWriter."""
+        if len(self._waiting) == _MOST_WAITING:
+            self._waiting = [merged(self._waiting, self._written)]
+        self._waiting.append(dict(row))
+        if row.get("wall_seconds", self._due) >= self._due or details.exist:
+            self._write(details)
+
+    def _write(self, details: Details) -> None:
+        row, self._waiting = merged(self._waiting, self._written), []
+        seconds = row.get("wall_seconds", 0.0)
+        self._written, self._due = row, seconds + seconds / _EVENTS
         values: list[Any] = [
             self._summary.Value(tag=tag(name), simple_value=float(value))
             for name, value in row.items()
@@ -114,7 +133,11 @@ class TensorBoardWriter:
 
     def close(self) -> None:
         """Close the file. See MetricsWriter."""
-        self._writer.close()
+        try:
+            if self._waiting:
+                self._write(Details())
+        finally:
+            self._writer.close()
 
 
 def _edges(numbers: Sequence[float]) -> np.ndarray:

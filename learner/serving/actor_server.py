@@ -16,12 +16,13 @@ from collections.abc import Callable
 from functools import partial
 from types import MappingProxyType
 
+from daedalus.learner.serving.orders import Orders
 from daedalus.learner.serving.query_responses import JoinResponses, StatusResponses
 from daedalus.learner.serving.rollout_intake import POLL_SECONDS, RolloutIntake
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.learner.serving.upload_checks import Shapes
-from daedalus.learner.serving.waiting_requests import EvaluationQueue, Orders, read_request
+from daedalus.learner.serving.waiting_requests import EvaluationQueue
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import (
@@ -34,10 +35,8 @@ from daedalus.protocol.limits import (
     Limits,
 )
 from daedalus.protocol.messages import (
-    Acknowledgement,
     ActorsReport,
     ActorsRequest,
-    OrderRequest,
     Refusal,
     RunEnded,
     RunStatus,
@@ -149,7 +148,7 @@ class ActorServer:
         self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
         self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before
         self._status, self._joins = StatusResponses(context, status), JoinResponses(context)
-        self.orders, self.evaluations = Orders(context.stop), EvaluationQueue()
+        self.orders, self.evaluations = Orders(context), EvaluationQueue()
         self.publisher = SnapshotPublisher(context, transport)
         self.rollouts = RolloutIntake(context, lambda: self.publisher.version)
         self._watchdog = SessionWatchdog(context, transport, self._step_down)
@@ -169,9 +168,8 @@ class ActorServer:
         self._serve(keys.snapshots(run), self.publisher.answer, SNAPSHOT_REQUEST_LIMITS)
         self._serve(keys.program(run, "*"), self._on_program)
         self._serve(keys.status(run), self._on_status, STATUS_REQUEST_LIMITS)
-        self._serve(keys.drain(run, "*"), self._on_drain, STATUS_REQUEST_LIMITS)
         self._serve(keys.reports(run, "*"), self._on_report, CLIENT_REPORT_LIMITS)
-        self._serve(keys.orders(run), self._on_order, STATUS_REQUEST_LIMITS)
+        self._serve(keys.orders(run, "*"), self.orders.receive, STATUS_REQUEST_LIMITS)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
@@ -303,22 +301,6 @@ class ActorServer:
 
     def _on_report(self, request: Request) -> None:
         request.reply(self._joins.report(keys.last_chunk(request.key), request.payload))
-
-    def _on_drain(self, request: Request) -> None:
-        name = keys.last_chunk(request.key)
-        with self._lock:
-            refusal = self._fleet.drain(name)
-        if refusal is None:
-            _logger.info("actor %s is drained: it leaves after its current rollout", name)
-        request.reply(encode(refusal or Acknowledgement(verdict="accepted")))
-
-    def _on_order(self, request: Request) -> None:
-        message = read_request(request.payload, STATUS_REQUEST_LIMITS, OrderRequest)
-        if isinstance(message, Refusal):
-            request.reply(encode(message))
-            return
-        _logger.info("an operator orders: %s", message.order)
-        self.orders.give(message.order, request)
 
     def _on_status(self, request: Request) -> None:
         if request.payload != LOOK:

@@ -23,8 +23,15 @@ from daedalus.protocol.texts import MAX_NAME, bounded_text, utc, without_secrets
 
 RESTARTED = "restarted"
 RESUMED = "resumed: "  # begin of the text of the event "checkpoint" of a run that undoes what came after it
+# Begins of the texts of events with an operator's order: of a checkpoint, of a drain, and of the end of the run.
+ORDERED_BY, DRAINED_BY, STOPPED_BY = "ordered by ", "drained by ", "stopped by "
 _MAX_BYTES = 1 << 20  # later events are left out
 _MAX_TEXT = 300  # characters
+
+
+def dated(text: str) -> str:
+    """Return a text with the time before it, by the clock of this host."""
+    return f"{utc(time.time())}: {text}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -97,7 +97,7 @@ class Actor:
     faults: int = 0  # rollouts that were left out of an update
     good_in_a_row: int = 0  # rollouts that were learned from since
     quarantined: str = ""  # the reason, if the newest incarnation is quarantined
-    drained: bool = False  # whether an operator asked the newest incarnation to leave
+    drained_by: str = ""  # who ordered the newest incarnation to leave; empty if nobody did
     env_steps: int = 0
     env_steps_per_second: float = 0.0
     policy_lag: int = 0  # of the newest rollout
@@ -153,7 +153,7 @@ class Actor:
         self.uploads, self.rows, self.episode_rows = next_sequence, 0, 0
         self.consecutive_unfit = self.faults = self.good_in_a_row = 0
         self.left = False
-        self.quarantined, self.drained = "", False
+        self.quarantined = self.drained_by = ""
         self.fetches = self.compact_snapshots = False
         self.client = None
 
@@ -401,12 +401,12 @@ class Fleet:
         actor.client = replace(report, safe_reason=bounded_text(report.safe_reason))
         return None
 
-    def drain(self, name: str) -> Refusal | None:
+    def drain(self, name: str, author: str) -> Refusal | None:
         """Ask an actor to leave after its current rollout. Return None, or a Refusal if it does not take part."""
         actor = self.actors.get(name)
         if actor is None or not self.is_present(actor):
             return Refusal(code="unknown", reason=f"no actor {name[:64]!r} takes part: `daedalus status` lists them")
-        actor.drained = True
+        actor.drained_by = actor.drained_by or author
         return None
 
     def _check_identity(self, join: Join) -> Refusal | None:
@@ -417,7 +417,7 @@ class Fleet:
             return Refusal(code="malformed", reason=str(error))
         known, former = self.actors.get(join.actor), self._former[join.actor, join.incarnation]
         if known is not None and known.incarnation == join.incarnation:
-            return Refusal(code="drained", reason="an operator drained this actor") if known.drained else None
+            return Refusal(code="drained", reason=f"drained by {known.drained_by}") if known.drained_by else None
         if former.quarantined:
             return Refusal(code="malformed", reason=f"this process was quarantined: {former.quarantined}; restart it")
         if former.replaced:

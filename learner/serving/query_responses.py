@@ -102,6 +102,7 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         safe_actions=client.safe_actions,
         rollouts_dropped=client.rollouts_dropped,
         safe_reason=client.safe_reason,
+        drained_by=actor.drained_by,
     )
 
 

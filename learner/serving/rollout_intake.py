@@ -410,10 +410,11 @@ class RolloutIntake:
         return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
 
     def _final_answer(self, sender: str, answer: Acknowledgement) -> Acknowledgement:
-        """Return the answer to a rollout, `drained` if its actor is asked to leave."""
+        """Return the answer to a rollout, `drained` and by whom if its actor is asked to leave."""
         actor = self._fleet.actors.get(sender)
-        is_final = answer.verdict in ("accepted", "rejected")
-        return replace(answer, verdict="drained") if actor is not None and actor.drained and is_final else answer
+        if actor is None or not actor.drained_by or answer.verdict not in ("accepted", "rejected"):
+            return answer
+        return replace(answer, verdict="drained", reason=f"drained by {actor.drained_by}")
 
     def _count_rejection(self, sender: str, rejected: Rejected) -> None:
         self._counters.rollouts_rejected[rejected.cause] += 1

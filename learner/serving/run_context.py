@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from daedalus.learner.reporting.metrics_rows import MetricsHistory
+from daedalus.learner.reporting.thinning import MetricsHistory
 from daedalus.learner.run.counters import Annealing, RunCounters
 from daedalus.learner.run.run_directory import run_name
 from daedalus.learner.serving.evaluations import Evaluations

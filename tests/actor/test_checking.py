@@ -304,15 +304,17 @@ def spec(**collection: object) -> RunSpec:
 def test_slow_steps_suggest_processes_where_they_help() -> None:
     waiting = EnvironmentReport(step_seconds=0.2, busy_share=0.0)
     busy = EnvironmentReport(step_seconds=0.2, busy_share=1.0)
-    advice = slow_steps(waiting, spec(rollout_length=16), processors=2)
-    assert advice == (
-        "a step takes 200 ms, and an actor steps its 16 environments in turn: 3.2 s a row, 51.2 s a rollout; "
-        "use --set environment.processes=true"
+    slow = slow_steps(waiting, spec(rollout_length=16), processors=2)
+    assert slow == (
+        "a step takes 200 ms, and an actor steps its 16 environments in turn: 3.2 s a row, 51.2 s a rollout"
     )
+    noted = advice(waiting, spec(rollout_length=16), processors=2)
+    assert noted == [f"{slow}; use --set environment.processes=true"]
     assert slow_steps(busy, spec(), processors=16)
     assert not slow_steps(busy, spec(), processors=2)  # its actors use both processors
     assert not slow_steps(waiting, spec(envs_per_actor=1), processors=2)
     assert not slow_steps(EnvironmentReport(step_seconds=0.001, busy_share=0.0), spec(), processors=2)
+    assert not slow_steps(waiting.model_copy(update={"vectorized": True}), spec(), processors=2)
     own = spec().model_copy(update={"environment": EnvironmentSpec(id="Any-v0", processes=True)})
     assert not slow_steps(waiting, own, processors=2)
 

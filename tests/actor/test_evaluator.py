@@ -15,6 +15,7 @@ from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.actor_config import own_origin
 from daedalus.protocol.messages import Join, Refusal
+from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 JOIN = Join(actor="e", incarnation=7, origin=own_origin(MemoryTransport(MemoryNetwork())))
@@ -81,6 +82,22 @@ def test_episodes_are_played_at_once_with_each_policy_until_none_is_left(network
         learner.transport.close()
     assert returns[0] == returns[2] != returns[4]
     assert returns[1] == returns[3] != returns[0]
+
+
+def test_evaluator_plays_the_next_plan_if_it_was_too_slow_for_the_first(network: MemoryNetwork) -> None:
+    """While it made its environments, others have played all that there was to play."""
+
+    class OfTwoPlans(ScriptedLearner):
+        def answer_join(self, request: Request) -> None:
+            super().answer_join(request)
+            self.epoch = 2
+
+    learner = OfTwoPlans(network, run_spec(seconds=1000.0))
+    learner.play_episodes, learner.play_seed = 2, 5
+    evaluator = RunningEvaluator(network)
+    learner.give(learner.snapshot(3, epoch=2))
+    assert learner.receive_report().learner_epoch == 2
+    evaluator.end(learner)
 
 
 def test_evaluated_episodes_are_not_cut_by_the_no_reward_limit(network: MemoryNetwork) -> None:

@@ -616,15 +616,12 @@ def test_exception_of_an_environment_is_reported_with_its_place(
         _play(processes, **settings)
 
 
-def test_traceback_is_logged_only_where_it_says_more_than_the_place(caplog: pytest.LogCaptureFixture) -> None:
-    with pytest.raises(EnvironmentSetupError):
-        _play(False, kwargs={"fault": "error"})
-    assert not caplog.records
+def test_traceback_of_the_users_code_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(EnvironmentSetupError):
         _play(False, kwargs={"fault": "error in a function"})
-    lines = caplog.text.splitlines()
-    assert "environment faulty_environments:Faulty-v0: step failed" in lines[0]
-    assert [line.split(" in ")[1] for line in lines if " in " in line] == ["step", "_connect"]
+    printed = capfd.readouterr().err
+    assert printed.startswith("Traceback (most recent call last):\n")
+    assert [line.split(" in ")[1] for line in printed.splitlines() if " in " in line] == ["step", "_connect"]
 
 
 def test_process_that_an_environment_ends_is_reported_with_its_status() -> None:

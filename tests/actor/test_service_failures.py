@@ -43,7 +43,7 @@ def test_drained_actor_ends(network: MemoryNetwork, actor: RunningActor) -> None
     acknowledge(request, "drained")
     actor.join()
     assert actor.error is None
-    assert LINES[-1] == "an operator drained this actor: it leaves the run"
+    assert LINES[-1] == "drained by an operator: this actor leaves the run"
 
 
 @pytest.mark.parametrize("how", ["run_ended", "finished"])

@@ -92,6 +92,17 @@ def test_time_to_look_for_a_learner(waits: bool) -> None:
     assert began + 30.0 < played.now < began + 32.0
 
 
+@pytest.mark.parametrize("run", [keys.ANY_RUN, "r"])
+def test_time_to_look_for_a_learner_holds_where_queries_get_no_answer(run: str) -> None:
+    """It begins before there is a connection; each query waits 5 s."""
+    config = ActorConfig(name="a", incarnation=7, run=run, timeout=8.0, searched_since=998.0)
+    played = PlayedSession(config)
+    played.silent = True
+    with pytest.raises(NoLearnerError, match="no learner answered within 8 s"):
+        played.go(lambda: False)
+    assert 1006.0 < played.now <= 1007.1
+
+
 @pytest.mark.parametrize("any_run", [False, True])
 def test_actor_stays_with_the_run_that_it_joined_first_unless_told_otherwise(any_run: bool) -> None:
     played = PlayedSession(ActorConfig(name="a", incarnation=7, any_run=any_run))
@@ -133,7 +144,7 @@ def test_actor_that_is_drained_while_it_sends_nothing_ends() -> None:
     played.verdict = None
     played.go(lambda: len(rollouts(played)) == 2)
     played.learners["r"] = refusal("drained")
-    with pytest.raises(RunOverError, match="an operator drained this actor"):
+    with pytest.raises(RunOverError, match=r"^why: this actor leaves the run$"):
         played.go(lambda: False)
 
 

@@ -343,6 +343,20 @@ def test_several_runs_are_one_page_with_a_table_and_curves_together(folder: Path
     assert colours.count("series-1") == colours.count("series-2") >= 4
 
 
+def test_runs_of_several_environments_have_tables_and_charts_of_their_own(folder: Path) -> None:
+    for name, preset in (("a", "cartpole"), ("b", "cartpole"), ("c", "acrobot")):
+        record(folder / "runs" / name, preset=preset, seed=ord(name))
+    assert report(["runs"]) == 0
+    text = " ".join(Page(folder / "report.html").text.split())
+    assert "3 runs of 2 environments" in text
+    acrobot, cartpole = text.index("Acrobot-v1 Comparison"), text.index("CartPole-v1 Comparison")
+    assert acrobot < text.index("c 1 490", acrobot) < cartpole < text.index("CartPole-v1, impala 2 490", cartpole)
+    html = (folder / "report.html").read_text()
+    assert html.count(">return of the training episodes<") == 2
+    clips = re.findall(r'<clipPath id="([^"]+)"', html)
+    assert len(set(clips)) == len(clips)  # a chart does not refer to parts of another
+
+
 def test_a_run_that_cannot_be_read_is_left_out(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record(folder / "runs/a")
     (record(folder / "runs/b") / "metrics.csv").unlink()
@@ -389,7 +403,6 @@ def test_numbers_of_a_hostile_run_that_cannot_be_drawn_are_left_out(folder: Path
         (["nowhere"], "nowhere does not exist: name a run directory, or a folder of run directories"),
         (["empty"], "empty is not a run directory: it has neither config.toml nor metrics.csv; name a run directory"),
         (["fresh"], "fresh has no metrics yet: wait until the run has made its first updates"),
-        (["run", "other"], "the runs play different environments"),
         (["text"], "text/summary.json is damaged: env_steps is not a number"),
         (["damaged"], "damaged/evaluation.json is damaged (return_mean: "),
         (["broken"], "broken/versions.json is damaged: it is not valid JSON; delete the file"),
@@ -400,7 +413,6 @@ def test_bad_input_is_one_line(
     folder: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     record(folder / "run")
-    record(folder / "other", preset="acrobot")
     record(folder / "text", env_steps=(1, 2, 3)).joinpath("summary.json").write_text('{"env_steps": "3"}')
     evaluated(record(folder / "damaged"), return_mean="NaN")
     (record(folder / "broken") / "versions.json").write_text("{")

@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import pytest
 from recorded_runs import record
 
 from daedalus.analysis.comparison import as_text, compare_groups
 from daedalus.analysis.recorded_run import RecordedRun, read_run
-from daedalus.analysis.run_groups import by_settings, by_user, check_comparable, text
-from daedalus.learner.run.run_files import RunDataError
+from daedalus.analysis.run_groups import by_settings, by_user, environment_of, select, text
 
 
 def run(folder: Path, name: str, *settings: str, seed: int = 1, preset: str = "cartpole") -> RecordedRun:
@@ -58,7 +56,7 @@ def test_a_name_of_many_settings_is_short_and_says_how_many_more_differ(tmp_path
     named = by_settings(runs)[0]
     assert named.name.startswith(f"map={'m' * 21}..., discount_factor=0.5")
     assert (named.name.endswith(", +1 more"), named.unnamed) == (True, ["training.trace_lambda"])
-    assert "the groups also differ in training.trace_lambda" in as_text(compare_groups(by_settings(runs)))
+    assert "the groups also differ in training.trace_lambda" in as_text([compare_groups(by_settings(runs))])
     longer = [run(tmp_path, f"n{n}", "environment.kwargs.map=" + "m" * n) for n in (30, 31)]
     assert [name for name, _ in names(*longer)] == ["map=" + "m" * n for n in (30, 31)]  # shortened, they were equal
 
@@ -109,11 +107,30 @@ def test_groups_of_the_user_that_no_setting_tells_apart_have_the_names_of_runs(t
     assert [group.name for group in by_user(both)] == ["CartPole-v1, impala", "c"]
 
 
-def test_runs_of_different_environments_are_refused(tmp_path: Path) -> None:
-    runs = [run(tmp_path, "a"), run(tmp_path, "b", preset="acrobot")]
-    with pytest.raises(RunDataError, match="the runs play different environments, whose returns cannot be compared"):
-        check_comparable(runs)
-    check_comparable(runs[:1])
+def test_each_environment_has_groups_of_its_own(tmp_path: Path) -> None:
+    for name, settings in (("a", []), ("b", ["collection.rollout_length=5"]), ("c", [])):
+        record(tmp_path / name, settings=settings, preset="acrobot" if name == "c" else "cartpole")
+    record(tmp_path / "d", finished=False, evaluation=None)
+    (record(tmp_path / "e") / "config.toml").write_text("")
+    environments, left_out = select([[tmp_path]], finished=True)
+    names = [(environment_of(groups), [group.name for group in groups]) for groups in environments]
+    assert names == [
+        ("Acrobot-v1", ["c"]),
+        ("CartPole-v1", ["rollout_length=5", "rollout_length=32"]),
+        ("", ["e"]),
+    ]
+    (unfinished,) = left_out
+    assert unfinished.startswith(f"left out: {tmp_path / 'd'} is not finished")
+    (groups,), _ = select([[tmp_path / "a", tmp_path / "e"]], finished=True)  # which can only be of CartPole-v1
+    assert len(groups) == 2
+
+
+def test_groups_of_the_user_are_compared_within_each_environment(tmp_path: Path) -> None:
+    for name in ("old-cartpole", "old-acrobot", "new-cartpole"):
+        record(tmp_path / name, preset=name.partition("-")[2])
+    environments, left_out = select([sorted(tmp_path.glob("old-*")), sorted(tmp_path.glob("new-*"))], finished=True)
+    assert [[len(group.runs) for group in groups] for groups in environments] == [[1], [1, 1]]
+    assert left_out == ["left out: group 2 has no run of Acrobot-v1"]
 
 
 def test_values_are_short_texts() -> None:

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import pytest
 
-from daedalus.cli.commands import actor, drain, router
+from daedalus.cli.commands import actor, orders, router
 
 
-@pytest.mark.parametrize("parser", [actor.parser, drain.parser])
+@pytest.mark.parametrize("parser", [actor.parser, orders.drain_parser])
 @pytest.mark.parametrize("text", ["nan", "-1", "-inf", "soon", ""])
 def test_a_timeout_that_is_no_duration_is_refused(
     parser: Callable[[], argparse.ArgumentParser], text: str, capsys: pytest.CaptureFixture[str]

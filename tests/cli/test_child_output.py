@@ -65,6 +65,24 @@ def test_few_lines_are_all_shown_and_nothing_makes_no_log(screen: Screen) -> Non
     assert len(logged) == 4
 
 
+def test_tracebacks_go_to_the_log_which_the_error_names(screen: Screen) -> None:
+    fail = "import sys\ndef step(): raise ValueError('stuck')\ntry: step()\nexcept ValueError as error: 1 / 0"
+    screen.run("actor-0", fail)
+    where = f"the traceback of actor-0 is in {screen.log}"
+    last = "ZeroDivisionError: division by zero"
+    assert screen.output.last_error("actor-0") == f"{last}; the traceback is in {screen.log}"
+    screen.run("actor-0", fail)
+    screen.output.close()
+    assert screen.err[:2] == [where, "ValueError: stuck"]
+    assert screen.err.count(where) == 1
+    assert last in screen.err
+    assert not any("File" in line or "Traceback" in line for line in screen.err)
+    logged = screen.log.read_text()
+    assert logged.count("[actor-0] Traceback (most recent call last):") == 4
+    assert '[actor-0]   File "<string>", line 2, in step' in logged
+    assert screen.output.withheld  # so that the folder with the log is kept
+
+
 PRINT_ERRORS = "import sys\nfor n in range(100): print('error', n, file=sys.stderr)"
 
 

@@ -117,7 +117,7 @@ def test_status_watch_redraws_a_frame_until_ctrl_c(tty: Tty, monkeypatch: pytest
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(status_module, "_FRAME_SECONDS", 0.0)
-    monkeypatch.setattr(status_module, "connect_until_interrupted", learner.connect)
+    monkeypatch.setattr(status_module, "connect_once", learner.connect)
     monkeypatch.setattr(status_module, "Screen", lambda: Interrupted(tty, tty))
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch"]) == 0
     shown = seen(tty)
@@ -148,13 +148,11 @@ def test_status_watch_prints_lines_elsewhere(
     original: Callable[[RunStatus], str] = getattr(status_module, name)
     monkeypatch.setattr(status_module, name, interrupted)
     monkeypatch.setattr(status_module, "_TEXT_SECONDS", 0.0)
-    monkeypatch.setattr(status_module, "connect_until_interrupted", connect)
+    monkeypatch.setattr(status_module, "connect_once", connect)
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch", *options]) == 0
     printed = capsys.readouterr()
-    assert (
-        printed.err.splitlines()
-        == ["daedalus status: no learner answers at this address; waiting for one (Ctrl-C ends)"] * 2
-    )  # before and after
+    reasons = ("nobody there", "no learner answers at this address")  # before and after
+    assert printed.err.splitlines() == [f"daedalus status: {each}; waiting for one (Ctrl-C ends)" for each in reasons]
     if options:
         assert json.loads(printed.out)["run"] == "mine"
     else:

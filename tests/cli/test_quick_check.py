@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ from daedalus.launch.environment_check import (
     quick_check,
     transformed_spaces,
 )
+from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -69,9 +71,21 @@ def test_a_run_does_not_wait_for_an_environment_that_hangs(monkeypatch: pytest.M
 
 def test_a_run_waits_longer_where_its_settings_depend_on_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MOST_SECONDS", 0.0)
-    spaces, _ = checked_defaults(run(faulty("")))
+    spaces, _ = checked_defaults(lambda _: run(faulty("")))
     assert spaces is not None
     assert "takes long: waiting up to 120 s, because its spaces decide the settings" in LINES[-1]
+
+
+def test_slow_environments_get_processes_of_their_own_unless_the_user_has_chosen() -> None:
+    slow = RunChoice(env="slow_environment:Slow-v0", assignments=["environment.kwargs.seconds=0.01"])
+    _, defaults = checked_defaults(slow.spec)
+    assert slow.spec(defaults).environment.processes
+    assert LINES[-1].endswith(" a rollout; each gets a process of its own instead (environment.processes=true)")
+    before = len(LINES)
+    chosen = replace(slow, assignments=[*slow.assignments, "environment.processes=false"])
+    _, defaults = checked_defaults(chosen.spec)
+    assert not chosen.spec(defaults).environment.processes
+    assert len(LINES) == before
 
 
 def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +188,7 @@ def mission(**settings: object) -> RunSpec:
 
 def test_default_settings_leave_out_a_text_that_never_changes() -> None:
     modules, stop = UserModules(frozenset({"mission_environment"})), threading.Event()
-    for spaces, defaults in (checked_defaults(mission()), expected_defaults(mission(), modules, stop)):
+    for spaces, defaults in (checked_defaults(lambda _: mission()), expected_defaults(mission(), modules, stop)):
         assert spaces is not None
         assert list(spaces.observations) == ["step"]
         assert defaults["environment"]["leave_out"] == ["mission"]

@@ -109,3 +109,16 @@ def test_bad_usage_ends_a_standing_actor_at_its_start(script: list[Any], monkeyp
     assert run(monkeypatch, "--stay", "--envs", "0") == 2
     monkeypatch.setattr(actor_process, "credentials_to_connect", credentials)
     assert run(monkeypatch, "--stay") == 2
+
+
+@pytest.mark.parametrize(
+    ("address", "link", "used"),
+    [
+        ("unixsock-stream/tmp/x/learner", "auto", "lan"),
+        ("unixsock-stream/tmp/x/learner", "wan", "wan"),
+        ("tcp/127.0.0.1:7447", "auto", "auto"),
+    ],
+)
+def test_a_unix_socket_is_never_measured_as_a_slow_link(address: str, link: Any, used: str) -> None:
+    options = actor_process.ActorOptions(connect=[address], link=link)
+    assert options.config(None).link == used

@@ -28,9 +28,9 @@ def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
             keys.status(status.run),
             lambda request: request.reply(encode(answers.get(request.size, EventsReport(page=events_page())))),
         )
-        connect = "daedalus.cli.commands.status.connect_until_interrupted"
+        connect = "daedalus.cli.commands.status.connect_once"
         monkeypatch.setattr(connect, lambda *_: MemoryTransport(network))
-        assert status_command([*CONNECT, *options]) == 0
+        assert status_command([*CONNECT, *options]) == (3 if status.problems else 0)
         return capsys.readouterr().out
 
     return show
@@ -42,13 +42,33 @@ def refused_join(**changes: str) -> RefusedJoin:
 
 
 def test_actors_are_shown_with_host_address_and_software(printed: Print) -> None:
-    (line,) = [each for each in printed(run_status(actors=(actor_status("arm-1"),))).splitlines() if "arm-1" in each]
-    assert line.endswith("; gpu-box, tcp/10.0.0.7:43092, daedalus-rl 1.0")
+    actors = actor_status("arm-1"), actor_status("arm-2", address=""), actor_status("pi", host="", software="")
+    lines = printed(run_status(actors=actors)).splitlines()
+    assert "  on gpu-box, daedalus-rl 1.0: arm-1 (tcp/10.0.0.7:43092), arm-2" in lines
+    assert "  on an unknown host: pi (tcp/10.0.0.7:43092)" in lines
+
+
+def test_state_fits_100_columns_and_names_what_it_leaves_out(printed: Print) -> None:
+    actors = tuple(
+        actor_status(f"{'n' * 40}-{lives}", lives=lives, epsilon=0.1, env_steps=10**9, rollouts_missed=3)
+        for lives in (1, 2)
+    )
+    lines = printed(run_status(actors=actors, problems=("why " * 100,), updates_per_batch=160)).splitlines()
+    assert max(map(len, lines)) <= 100
+    assert "  --json has more columns: down, MB/h up, accepted, envs, lives, epsilon, env_steps" in lines
+
+
+def test_policy_lag_is_shown_in_batches(printed: Print) -> None:
+    actors = actor_status("arm-1", policy_lag=160), actor_status("arm-2", policy_lag=400)
+    shown = printed(run_status(policy_lag_mean=80.0, updates_per_batch=160, actors=actors))
+    for part in ("policy lag 0.5 batches (80 updates)", "  1 batch  ", "  2.5 batches  "):
+        assert part in shown
+    assert "policy lag 0.8 updates" in printed(run_status(policy_lag_mean=0.75))
 
 
 def test_the_epsilon_of_an_actor_that_explores_is_shown(printed: Print) -> None:
     shown = printed(run_status(actors=(actor_status("arm-1", epsilon=0.5), actor_status("arm-2"))))
-    cells = {line.split()[0]: line.split() for line in shown.splitlines() if "arm-" in line}
+    cells = {line.split()[0]: line.split() for line in shown.splitlines() if " alive " in line}
     column = next(line.split() for line in shown.splitlines() if "epsilon" in line).index("epsilon")
     assert (cells["arm-1"][column + 1], cells["arm-2"][column + 1]) == ("0.5", "-")  # `0.5 s` of `seen` is two words
 

@@ -215,7 +215,7 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
 def test_a_run_that_is_not_there_is_named_with_those_that_are(
     operator: MemoryTransport, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("daedalus.cli.commands.status.connect_until_interrupted", lambda *_: operator)
+    monkeypatch.setattr("daedalus.cli.commands.status.connect_once", lambda *_: operator)
     assert status_command(["--connect", "tcp/127.0.0.1:1", "--run", "other"]) == 1
     assert capsys.readouterr().err == "daedalus status: no learner of run 'other' answers; the runs here are 'r'\n"
 
@@ -298,7 +298,7 @@ def test_of_two_learners_of_a_run_both_are_shown_and_the_newer_is_named(
     problem = "the learner with epoch 1f is not the newest of this run: actors follow epoch 2f"
     assert shown[1].problems[0].startswith(problem)
     assert LearnerSource(operator).status(0).learner_epoch == 0x2F  # type: ignore[union-attr]
-    monkeypatch.setattr("daedalus.cli.commands.status.connect_until_interrupted", lambda *_: operator)
+    monkeypatch.setattr("daedalus.cli.commands.status.connect_once", lambda *_: operator)
     assert status_command(["--connect", "tcp/127.0.0.1:1", "--quiet"]) == 3
     assert "mine: the learner with epoch 1f is not the newest" in capsys.readouterr().out
 

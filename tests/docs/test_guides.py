@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
 from building import SPACES, make_rollouts
-from pages import DOCS, code_blocks
+from pages import DOCS, ROOT, code_blocks
 from plain import PlainEnvironments, act, choices, plain_spaces
 from recorded_runs import record
 
+from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.make import make_environments
 from daedalus.launch.callbacks import TrainingRun
 from daedalus.launch.child_output import ChildOutput
@@ -51,6 +52,25 @@ def test_the_environment_can_be_played(folder: Path) -> None:
     assert steps[-1][1].tolist() == [0.99, -0.01]
     assert steps[-1][2].tolist() == [True, False]
     environments.close()
+
+
+def test_the_readmes_environment_of_one_s_own_works_as_it_is_pasted(folder: Path) -> None:
+    code = code_blocks((ROOT / "README.md").read_text("utf-8"), "python")[0]
+    assert len([line for line in code.splitlines() if line]) <= 12
+    (folder / "hallway.py").write_text(code)
+    spec = EnvironmentSpec(id="hallway:Hallway-v0")
+    modules = UserModules(frozenset({"hallway"}))
+    report = check_environment(spec, modules, seconds=10.0, env_steps=500)
+    assert (report.problems, report.warnings) == ((), ())
+    assert 1.0 in report.returns  # random actions reach the end now and then
+
+
+def test_the_settings_of_stable_baselines3_are_a_run(folder: Path) -> None:
+    (folder / "ppo.toml").write_text(example("stable_baselines3.md", "toml"))
+    spec = run_spec(read_settings(folder / "ppo.toml"))
+    rows = spec.batch_rollouts * spec.collection.rollout_length * spec.collection.envs_per_actor
+    assert rows == 16 * 1024  # n_envs x n_steps
+    assert rows // spec.training.minibatches == 512  # batch_size
 
 
 def test_the_preset_is_a_run(folder: Path) -> None:

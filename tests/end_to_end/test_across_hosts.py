@@ -122,6 +122,28 @@ def test_actors_are_noticed_as_gone_when_their_link_fails_and_return_when_it_wor
     assert [actor.process.poll() for actor in actors] == [None] * 3
 
 
+def test_a_firewall_that_drops_packets_is_named_by_every_command(network: Network) -> None:
+    central, player = network.host("central"), network.host("player")
+    central.lose(player)
+    address = address_of(central)
+    to, silent = ("--connect", address), rf"no answer from {address}: check the address, .* no firewall drops packets"
+    once = [player.start(*words, *to) for words in (("actor", "--timeout", 0.5), ("status",), ("drain", "arm"))]
+    lasting = [
+        player.start(*words, *to)
+        for words in (
+            ("learner", "cartpole"),
+            ("actor", "--evaluator"),
+            ("exporter", "--listen", "127.0.0.1:0"),
+            ("gateway", "--listen", "127.0.0.1:0"),
+            ("router", "--insecure", "--listen", address_of(player)),
+        )
+    ]
+    for command in (*once, *lasting):
+        command.expect(silent)
+    assert [command.wait() for command in once] == [1, 1, 1]
+    assert [command.process.poll() for command in lasting] == [None] * 5
+
+
 def test_learner_and_actors_reconnect_after_the_host_of_the_router_was_unreachable(network: Network) -> None:
     middle, central = network.host("router"), network.host("learner")
     players = [network.host(name) for name in ("arm", "box", "car")]

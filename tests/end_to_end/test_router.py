@@ -31,11 +31,13 @@ def test_a_router_prints_its_address_and_ends_on_sigterm(start: Start, address: 
 
 
 def test_a_run_works_over_two_routers_that_start_in_any_order(start: Start, address: str, other_address: str) -> None:
-    start("router", "--listen", other_address, "--connect", address).expect("listening")
+    second = start("router", "--listen", other_address, "--connect", address)
+    second.expect(f"nothing answers at {address}: .*; trying again")
     learner = start("learner", "cartpole", "--connect", other_address, "--run-dir", "run", "--env-steps", 30000)
     start("actor", "--connect", address)
     start("router", "--listen", address)
     assert learner.wait() == 3, learner.output
+    second.expect(f"connected to {address}")
 
 
 def test_a_learner_that_waits_for_a_router_is_alive_and_leaves_no_directory(
@@ -52,7 +54,9 @@ def test_a_learner_that_waits_for_a_router_is_alive_and_leaves_no_directory(
 def test_router_and_exporter_accept_only_certificates_of_their_ca(start: Start, address: str, tmp_path: Path) -> None:
     certificates = make_certificates(tmp_path / "certs")
     tls = address.replace("tcp/", "tls/")
-    start("router", "--listen", tls, "--tls", certificates / "router").expect("listening")
+    start("router", "--listen", tls, "--tls", certificates / "router").expect(
+        f"listening on {tls}; the certificate is for .*localhost, 127.0.0.1"
+    )
     asked = ("exporter", "--connect", tls, "--listen", "127.0.0.1:0", "--tls")
     start(*asked, certificates / "operator").expect("http://")
     strange = start(*asked, make_certificates(tmp_path / "strange") / "operator")

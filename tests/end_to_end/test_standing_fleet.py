@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -14,12 +15,15 @@ from processes import Running, until
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Refusal
+from daedalus.transport.status_query import waiting_actors
 from daedalus.transport.zenoh_transport import connect, listen
 
 Start = Callable[..., Running]
 
 
-def test_an_actor_that_stays_serves_the_next_run_until_it_is_drained(start: Start, address: str) -> None:
+def test_an_actor_that_stays_serves_the_next_run_until_it_is_drained(
+    start: Start, address: str, tmp_path: Path
+) -> None:
     router = start("router", "--listen", address)
     router.expect("listening")
     actor = start("actor", "--connect", address, "--name", "standing", "--envs", 8, "--stay")
@@ -31,15 +35,32 @@ def test_an_actor_that_stays_serves_the_next_run_until_it_is_drained(start: Star
     second = start("learner", "cartpole", "--connect", address, "--run-dir", "second", *endless)
     actor.expect("joined run 'second'")
     second.expect(r"updates .*/s")
-    unknown = start("drain", "other", "--connect", address)
+    start("actor", "--connect", address, "--name", "idle", "--run", "third", "--stay")
+    operator = connect([address])
+    until(lambda: "idle" in waiting_actors(operator))
+    operator.close()
+    status = start("status", "--connect", address)
+    status.expect("1 actor waits for a run: idle")
+    unknown = start("drain", "standing", "other", "--connect", address)
     assert unknown.wait() == 1
-    unknown.expect("daedalus drain: no actor 'other' takes part")
-    drained = start("drain", "standing", "--connect", address)
+    unknown.expect("daedalus drain: no actor 'other' takes part or waits for a run")
+    drained = start("drain", "standing", "idle", "--connect", address)
     assert drained.wait() == 0, drained.output
     drained.expect("actor standing has left")
+    drained.expect("actor idle has left")
+    author = "the operator at .*, without an operator's certificate"
     assert actor.wait() == 0, actor.output
-    actor.expect("an operator drained this actor")
-    second.expect("actor standing is drained: it leaves after its current rollout")
+    actor.expect(f"drained by {author}: this actor leaves the run")
+    second.expect(f"actor=standing: drained by {author}: it leaves after its current rollout")
+    saved = start("checkpoint", "second", "--connect", address)
+    assert saved.wait() == 0, saved.output
+    saved.expect("run 'second': checkpoint saved at .* env_steps")
+    stopped = start("stop", "second", "--connect", address)
+    assert stopped.wait() == 0, stopped.output
+    stopped.expect("run 'second': the learner has ended")
+    assert second.wait() == 0, second.output
+    second.expect(f"stopped by {author}")
+    assert re.fullmatch(author, json.loads((tmp_path / "second" / "summary.json").read_text())["stopped_by"])
 
 
 def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_actors(

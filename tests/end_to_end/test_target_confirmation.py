@@ -42,6 +42,9 @@ def players(folder: Path) -> list[int]:
     return found
 
 
+NOT_YET = "not there yet: the new episodes have a mean return of 0. That is normal"
+
+
 def test_training_continues_until_new_episodes_confirm_the_target(
     train: Callable[..., Running], tmp_path: Path
 ) -> None:
@@ -49,7 +52,7 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     running = train()
     assert running.wait() == 0, running.output
     first, second = (index for index, line in enumerate(running.lines) if line.startswith("target 1 reached: "))
-    assert "not confirmed: return 0; training continues" in running.lines[first:second]
+    assert any(line.startswith(NOT_YET) for line in running.lines[first:second])
     result = summary(tmp_path)
     assert (result["solved"], result["finished"], result["confirmation_return_mean"]) == (True, True, 1.0)
     confirmation = result["confirmation"]
@@ -58,7 +61,7 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     assert result["episodes"] >= 20  # as many new training episodes as the target asks for, before the second attempt
     asked, refused, confirmed = (each.text for each in read_events(tmp_path / "run") if each.kind == "target")
     assert asked == confirmed == running.lines[first]
-    assert refused == "not confirmed: return 0; training continues"
+    assert refused.startswith(NOT_YET)
     running.expect("confirmation: return 1 over 10 new sampled episodes of the policy at that moment")
 
 
@@ -72,7 +75,7 @@ def test_a_learner_without_launcher_confirms_its_target_too(start: Start, tmp_pa
     words = (*connect, certificates / "learner", "--run-dir", "run", *WORDS)
     learner = start("learner", "--env", "lucky_environment:Lucky-v0", *words)
     start("actor", *connect, certificates / "actor-arm", "--allow-module", "lucky_environment")
-    learner.expect("not confirmed: return 0; training continues")
+    learner.expect(NOT_YET)
     assert learner.wait() == 0, learner.output
     assert summary(tmp_path)["confirmation_return_mean"] == 1.0
 

@@ -21,7 +21,9 @@ def tls(address: str) -> str:
     return address.replace("tcp/", "tls/")
 
 
-def test_authorised_actors_of_other_machines_join_train_over_tls(start: Start, tls: str, certificates: Path) -> None:
+def test_authorised_actors_of_other_machines_join_train_over_tls_until_an_operator_stops_it(
+    start: Start, tls: str, certificates: Path, tmp_path: Path
+) -> None:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     training = ("--listen", tls, "--tls", certificates / "learner", "--actors", 1, *endless)
     train = start("train", "cartpole", *training)
@@ -33,6 +35,16 @@ def test_authorised_actors_of_other_machines_join_train_over_tls(start: Start, t
     asking = ("status", "--connect", tls, "--quiet", "--tls")
     assert start(*asking, certificates / "actor-arm").wait() == 2
     until(lambda: start(*asking, certificates / "operator").wait() == 0)
+    (run,) = (directory.name for directory in (tmp_path / "runs").iterdir())
+    order = ("stop", run, "--connect", tls, "--tls")
+    refused = start(*order, certificates / "actor-arm")
+    assert refused.wait() == 2
+    refused.expect("daedalus stop: .*actor-arm holds the certificate of actor 'arm', but operator or learner or router")
+    stopped = start(*order, certificates / "operator")
+    assert stopped.wait() == 0, stopped.output
+    stopped.expect(f"run '{run}': checkpoint saved at ")
+    assert train.wait() == 1
+    train.expect("stopped by operator operator at .*; continue with: daedalus resume")
 
 
 def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls: str, certificates: Path) -> None:

@@ -303,7 +303,7 @@ def test_client_whose_presence_cannot_be_declared_is_refused(
 
 @pytest.mark.parametrize(
     ("verdict", "text"),
-    [("quarantined", "the learner quarantined this client: why"), ("drained", "an operator drained this client")],
+    [("quarantined", "the learner quarantined this client: why"), ("drained", "why: this client leaves the run")],
 )
 def test_verdict_on_a_client_ends_its_connection_and_says_why(
     learner: ScriptedLearner, connect: Connect, verdict: Any, text: str

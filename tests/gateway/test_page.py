@@ -206,7 +206,7 @@ def test_an_order_that_the_gateway_does_not_receive_or_answer_is_reported(
     gateway = RunningGateway(network, follows=False, operator=OperatorToken(tmp_path / "token"))
     asked, answer = threading.Event(), threading.Event()
 
-    def give_order(order: Order) -> tuple[bool, str]:
+    def give_order(order: Order, token: str) -> tuple[bool, str]:
         asked.set()
         answer.wait(LIMIT)
         return True, ""

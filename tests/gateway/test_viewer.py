@@ -158,7 +158,7 @@ def test_other_runs_are_sent_once(gateway: RunningGateway, watch: Watch) -> None
 
 def test_orders_need_the_operators_token(gateway: RunningGateway, watch: Watch) -> None:
     source, status = FakeSource(), run_status()
-    gateway.call(lambda: setattr(gateway.data, "give_order", lambda order: source.order(status, order)))
+    gateway.call(lambda: setattr(gateway.data, "give_order", lambda *order: source.order(status, *order)))
     viewer = watch()
     viewer.send(type="order", order="stop", token="wrong")
     assert "not the operator's token" in viewer.receive("refused")["reason"]
@@ -169,7 +169,7 @@ def test_orders_need_the_operators_token(gateway: RunningGateway, watch: Watch) 
         "order": "checkpoint",
         "result": "checkpoint saved at 7 env_steps",
     }
-    assert source.orders == ["checkpoint"]
+    assert source.orders == [("checkpoint", "the operator")]
 
 
 def test_an_order_that_the_learner_does_not_take_is_answered(gateway: RunningGateway, watch: Watch) -> None:
@@ -287,7 +287,7 @@ def test_no_message_without_a_token_orders_or_asks_anything(
     gateway: RunningGateway, learner: ScriptedLearner, path: str, kind: str
 ) -> None:
     orders: list[str] = []
-    gateway.call(lambda: setattr(gateway.data, "give_order", lambda order: orders.append(order) or ""))
+    gateway.call(lambda: setattr(gateway.data, "give_order", lambda order, _: orders.append(order) or ""))
     with connect(f"ws://127.0.0.1:{gateway.port}/{path}", open_timeout=LIMIT) as socket:
         socket.send(json.dumps({"type": kind, "order": "stop", "token": ""}))
         assert json.loads(socket.recv(timeout=LIMIT))["code"] in ("malformed", "out_of_turn")
@@ -309,7 +309,9 @@ def test_beyond_loopback_a_page_needs_a_token_and_orders_that_of_an_operator(
     running = RunningGateway(network, made / "gateway", follows=False)
     context = ssl.create_default_context(cafile=made / "gateway" / "ca.pem")
     orders: list[str] = []
-    running.call(lambda: setattr(running.data, "give_order", lambda order: (orders.append(order) is None, "")))
+    running.call(
+        lambda: setattr(running.data, "give_order", lambda *order: (orders.append(" by ".join(order)) is None, ""))
+    )
     try:
         for token, admitted in (("", False), ("wrong", False), (phone, True), (operator, True)):
             with connect(f"wss://127.0.0.1:{running.port}/watch", ssl=context, open_timeout=LIMIT) as socket:
@@ -321,7 +323,7 @@ def test_beyond_loopback_a_page_needs_a_token_and_orders_that_of_an_operator(
                     assert viewer.receive("ordered", "refused")["type"] == (
                         "ordered" if token == operator else "refused"
                     )
-        assert orders == ["stop"]
+        assert orders == ["stop by operator operator"]
     finally:
         running.close()
 

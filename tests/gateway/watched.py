@@ -62,7 +62,7 @@ class FakeSource:
         self.oldest = 0  # row that it still has
         self.page_rows = 3  # in one answer
         self.asked_actors: list[int] = []
-        self.orders: list[Order] = []
+        self.orders: list[tuple[Order, str]] = []
         self.asked = threading.Semaphore(0)
 
     def status(self, max_actors: int) -> RunStatus | None:
@@ -85,8 +85,8 @@ class FakeSource:
             values=np.array(values, np.float64).reshape(len(numbers), len(columns)),
         )
 
-    def order(self, status: RunStatus, order: Order) -> tuple[bool, str]:
-        self.orders.append(order)
+    def order(self, status: RunStatus, order: Order, token: str) -> tuple[bool, str]:
+        self.orders.append((order, token))
         return True, "checkpoint saved at 7 env_steps" if order == "checkpoint" else ""
 
 

@@ -11,6 +11,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer.record_writer import RecordWriter
 
+from daedalus.learner.reporting import thinning
 from daedalus.learner.reporting.csv_writer import CsvWriter, cut_rows
 from daedalus.learner.reporting.metrics_rows import COLUMNS, Details, read_rows, tag
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
@@ -153,6 +154,81 @@ def test_csv_writes_its_header_anew_after_a_part_of_it(tmp_path: Path, part: byt
     path.write_bytes(part)
     write(path)
     assert path.read_text().strip() == ",".join(COLUMNS)
+
+
+MONTH = 30 * 86_400
+
+
+def test_the_files_of_a_month_are_bounded_and_lose_nothing_in_aggregate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(thinning, "MAX_BYTES", most := 1 << 17)
+    path, count = tmp_path / "metrics.csv", 8000
+    generator = np.random.default_rng(1)
+    rows = [
+        {
+            "wall_seconds": MONTH * number / count,
+            "env_steps": 640 * number,
+            "updates": 5 * number + int(generator.integers(5)),
+            "episodes": 3 * number,
+            "entropy": generator.random(),
+            "episode_return_mean": generator.random(),
+        }
+        for number in range(1, count + 1)
+    ]
+    with closing(CsvWriter(path)) as writer, closing(TensorBoardWriter(tmp_path)) as events:
+        for row in rows:
+            writer.write(row, NONE)
+            events.write(row, NONE)
+            assert path.stat().st_size <= most
+    kept = list(read_rows(path))
+    assert kept[-300:] == rows[-300:]  # the newest are as they were
+    by_steps = {row["env_steps"]: row for row in rows}
+    newest = ("wall_seconds", "updates", "episodes", "episode_return_mean")  # counters, and statistics at the time
+    assert all(row[name] == by_steps[row["env_steps"]][name] for row in kept for name in newest)
+    gaps = np.diff([row["env_steps"] for row in kept])
+    assert np.ptp(gaps[:100]) <= 640  # even
+
+    def mean(of: list[dict[str, float]]) -> float:
+        """Return the mean entropy of all updates."""
+        return float(np.average([row["entropy"] for row in of], weights=np.diff([0, *(row["updates"] for row in of)])))
+
+    assert mean(kept) == pytest.approx(mean(rows), abs=1e-12)
+    entropy = EventAccumulator(str(tmp_path), {"scalars": 0}).Reload().Scalars("train/entropy")
+    assert 3000 < len(entropy) < 5000
+    assert (entropy[0].step, entropy[-1].step) == (640, 640 * count)
+
+
+def test_what_crashes_while_old_rows_are_merged_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thinning, "MAX_BYTES", 4000)
+    path, rows = tmp_path / "metrics.csv", [{"env_steps": step, "user/score": 1.5} for step in range(1000, 1150)]
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as failing, closing(CsvWriter(path)) as writer:
+        for index, row in enumerate(rows):
+            writer.write(row, NONE)
+            if not index:  # which had a new column
+                failing.setattr("os.replace", full)
+    assert list(read_rows(path)) == rows
+    (tmp_path / ".metrics.csv.1.partial").write_text("env_steps")  # a learner was killed while it wrote this
+    write(path, {"env_steps": 1150, "user/score": 2.5})
+    kept = list(read_rows(path))
+    assert kept[-20:] == [*rows[-19:], {"env_steps": 1150, "user/score": 2.5}]
+    assert len(kept) <= 75
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
+def test_a_run_that_continues_bounds_the_file_of_an_earlier_release(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "metrics.csv"
+    write(path, *({"env_steps": step, "wall_seconds": step / 10} for step in range(1000)))
+    monkeypatch.setattr(thinning, "MAX_BYTES", 4000)
+    assert [row["env_steps"] for row in cut_rows(path, 997)] == [998, 999]
+    assert path.stat().st_size <= 4000
+    assert [row["env_steps"] for row in read_rows(path)][-10:] == [*range(988, 998)]
 
 
 def test_tensorboard_scalars_are_against_env_steps(tmp_path: Path) -> None:

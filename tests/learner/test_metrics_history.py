@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daedalus.learner.reporting import metrics_rows
+from daedalus.learner.reporting import thinning
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics_rows import Details, MetricsHistory, read_rows
+from daedalus.learner.reporting.metrics_rows import Details, read_rows
+from daedalus.learner.reporting.thinning import MetricsHistory
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import METRICS_LIMITS
 from daedalus.protocol.messages import MAX_PAGE_VALUES, MetricsReport
@@ -42,7 +43,7 @@ def test_rows_have_a_value_for_each_column_that_any_of_them_has() -> None:
 
 
 def test_a_long_run_is_thinned_over_its_whole_length_and_keeps_the_newest_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_rows, "MAX_ROWS", 8)
+    monkeypatch.setattr(thinning, "MAX_ROWS", 8)
     history, steps = MetricsHistory(), list[float]()
     for step in range(1000):
         history.add({"env_steps": step})
@@ -54,7 +55,7 @@ def test_a_long_run_is_thinned_over_its_whole_length_and_keeps_the_newest_row(mo
 
 
 def test_an_evaluation_survives_the_row_that_it_came_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_rows, "MAX_ROWS", 4)
+    monkeypatch.setattr(thinning, "MAX_ROWS", 4)
     history = MetricsHistory()
     for step in range(33):
         evaluation = {"evaluation_return_mean": float(step), "evaluation_env_steps": step} if step % 16 == 3 else {}

@@ -10,21 +10,21 @@ from typing import Any
 import pytest
 from log_lines import LINES
 from processes import LIMIT, until
-from session_fleet import GatedActor, LearnerProcess
+from session_fleet import GatedActor, LearnerProcess, order_to
 
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.learner.reporting import recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run import heartbeat
-from daedalus.learner.serving import actor_server, run_context, waiting_requests
+from daedalus.learner.serving import actor_server, orders, run_context
 from daedalus.learner.training import checkpointer
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.protocol import keys
-from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Message, OrderRequest, Refusal, RunStatus, StatusReport
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunStatus, StatusReport
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 ACTORS = 15
@@ -185,13 +185,11 @@ def test_training_goes_on_and_a_learner_ends_while_its_disk_does_not_answer(
     monkeypatch.setattr(recorder, "_CLOSE_SECONDS", 0.1)
     monkeypatch.setattr(heartbeat, "_END_SECONDS", 0.1)
     monkeypatch.setattr(run_context, "SLOW_DISK_SECONDS", 0.0)
-    monkeypatch.setattr(waiting_requests, "_ANSWER_SECONDS", 0.05)
+    monkeypatch.setattr(orders, "_ANSWER_SECONDS", 0.05)
     operator = MemoryTransport(network)
 
     def order() -> Acknowledgement:
-        answer = decode(
-            operator.query(keys.orders("run"), encode(OrderRequest(order="checkpoint")), timeout=LIMIT)[0], Limits()
-        )
+        answer = order_to(network, "checkpoint")
         assert isinstance(answer, Acknowledgement)
         return answer
 
@@ -246,17 +244,13 @@ def test_drained_actor_leaves_after_its_rollout_and_the_others_play_on(network: 
     leaving, staying = GatedActor(network, "leaving"), GatedActor(network, "staying")
     leaving.await_rollout()
     staying.await_rollout()
-    operator = MemoryTransport(network)
-
-    def drain(name: str) -> Message:
-        return decode(operator.query(keys.drain("run", name), timeout=LIMIT)[0], Limits())
-
-    assert drain("leaving") == Acknowledgement(verdict="accepted")
-    unknown = drain("other")
+    assert order_to(network, "drain", "leaving") == Acknowledgement(verdict="accepted")
+    unknown = order_to(network, "drain", "other")
     assert isinstance(unknown, Refusal)
     assert "no actor 'other' takes part" in unknown.reason
     leaving.open_gate()
     assert leaving.join() is False
+    assert count("drained by operator alice at laptop: this actor leaves the run") == 1
     staying.collector.waiting.clear()
     staying.open_gate()
     for _ in range(2):

@@ -3,7 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from log_lines import LINES
 from processes import LIMIT, until
 from recorded_runs import record
 
+from daedalus.learner.reporting import thinning
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.trackers import tracking
@@ -120,7 +121,7 @@ def test_a_resumed_run_continues_under_its_id_and_makes_no_step_twice(tmp_path: 
         pass
     TAPE.clear()
     add_rows(directory, 2500)  # from a checkpoint before the last row
-    add_rows(directory, 2600, evaluation_return_mean=12.0)
+    add_rows(directory, 2600, evaluation_return_mean=12.0, evaluation_env_steps=2550)
     add_rows(directory, 3500, 4000)
     with logged(directory):
         pass
@@ -159,12 +160,29 @@ def test_the_state_after_a_failure_has_the_rows_that_were_logged(tmp_path: Path)
         Tape.fails.set()
         add_rows(directory, 4000)
         until(warnings)
-    assert json.loads((directory / "tracker-wandb.json").read_text()) == {"id": "new", "rows": 3, "env_steps": 3000}
+    state = {"id": "new", "env_steps": 3000, "wall_seconds": 180.0, "evaluation_env_steps": -1}
+    assert json.loads((directory / "tracker-wandb.json").read_text()) == state
 
 
 def test_a_damaged_state_begins_anew(tmp_path: Path) -> None:
     directory = record(tmp_path / "run", finished=False, evaluation=None)
-    (directory / "tracker-wandb.json").write_text('{"id": 5, "rows": "many"}')
+    (directory / "tracker-wandb.json").write_text('{"id": 5, "env_steps": "many"}')
     with logged(directory):
         pass
     assert TAPE[:2] == [("opened", "", 1), 1000]
+
+
+def test_every_row_is_logged_once_while_old_rows_are_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thinning, "MAX_BYTES", 4000)
+    directory = record(tmp_path / "run", finished=False, evaluation=None)
+    with closing(CsvWriter(directory / "metrics.csv")) as writer, logged(directory):
+        for step in range(4000, 104_000, 1000):
+            evaluation = {"evaluation_return_mean": 1.0, "evaluation_env_steps": step} if step % 9000 == 0 else {}
+            writer.write({"env_steps": step, "wall_seconds": step / 10, **evaluation}, Details())
+            if step % 10_000 == 0:  # fewer rows than the newest that are never merged
+                until(lambda: {step, (step, "evaluated")} & set(TAPE))  # noqa: B023
+    logged_steps = [each[0] if isinstance(each, tuple) else each for each in TAPE[1:-2]]
+    assert logged_steps == list(range(1000, 104_000, 1000))
+    evaluated = [each[0] for each in TAPE if isinstance(each, tuple) and each[1] == "evaluated"]
+    assert evaluated == list(range(9000, 104_000, 9000))
+    assert len((directory / "metrics.csv").read_text().splitlines()) < 90  # the file was thinned meanwhile

@@ -255,7 +255,9 @@ MESSAGES: dict[str, Message] = {
         numbers=np.array([4, 6], np.int64),
         values=np.array([[128.0, 0.5], [256.0, -0.25]]),
     ),
-    "order_request": OrderRequest(order="checkpoint"),
+    "order_request": OrderRequest(
+        order="drain", run="r", learner_epoch=9, number=7, actor="wing-1", host="laptop", token="operator alice"
+    ),
 }
 
 

@@ -20,6 +20,7 @@ from daedalus.actor.session.conversation import (
     Unsubscribe,
     Wait,
     WatchPresence,
+    WithdrawPresence,
     Work,
 )
 from daedalus.actor.session.session_engine import ActorSession, Begin, Collect, Encode, Load, Prepare
@@ -27,7 +28,7 @@ from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
-from daedalus.transport.interface import Inbox, TransportError
+from daedalus.transport.interface import Declaration, Inbox, TransportError
 
 from .kernel import Kernel
 from .ledger import Ledger
@@ -79,7 +80,8 @@ class ActorProcess:
     _steps: Steps[Any] = field(init=False)
     _channel: Channel = field(init=False)  # of its own timers
     _inboxes: dict[str, Inbox] = field(default_factory=dict)
-    _declared: set[str] = field(default_factory=set)
+    _watched: set[str] = field(default_factory=set)
+    _declared: dict[str, Declaration] = field(default_factory=dict)
     _waits: int = 0  # how many waits have begun; a timer of an earlier one is ignored
     _is_waiting: bool = False
     _has_event: bool = False  # since the last step
@@ -263,13 +265,15 @@ class ActorProcess:
             case Unsubscribe(key):
                 self._inboxes.pop(key).close()
             case WatchPresence(key):
-                if key not in self._declared:
+                if key not in self._watched:
                     self.link.watch_presence(key, self._on_presence)
+                    self._watched.add(key)
             case DeclarePresence(key):
                 if key not in self._declared:
-                    self.link.declare_presence(key)
-        if isinstance(action, WatchPresence | DeclarePresence):
-            self._declared.add(action.key)
+                    self._declared[key] = self.link.declare_presence(key)
+            case WithdrawPresence(key):
+                if key in self._declared:
+                    self._declared.pop(key).close()
 
     # ---------------------------------------------------------------------------------------------- rollouts
 

@@ -229,6 +229,9 @@ class Link:
             if matches(key, declared):
                 watch.look_later(declared)
 
+    def present(self, key: str) -> list[str]:
+        return [declared for link in self.network.links for declared in link.tokens if matches(key, declared)]
+
     def reopen(self, unless_served: str | None = None) -> bool:
         network, kernel = self.network, self.network.kernel
         if self._is_router:

@@ -46,8 +46,7 @@ def address(certificates: Path) -> Iterator[str]:
             keys.program("r", "*"),
             keys.snapshots("r"),
             keys.status("r"),
-            keys.drain("r", "*"),
-            keys.orders("r"),
+            keys.orders("r", "*"),
         ):
             learner.serve(key, lambda request: request.reply(b"the learner's"))
         yield where
@@ -176,12 +175,33 @@ def reads_the_status(scene: Scene) -> bool:
     return scene.answered(keys.status("r"))
 
 
-def drains(scene: Scene) -> bool:
-    return scene.answered(keys.drain("r", scene.name)) or scene.answered(keys.drain("r", "box"))
-
-
 def gives_orders(scene: Scene) -> bool:
-    return scene.answered(keys.orders("r"))
+    return scene.answered(keys.orders("r", scene.name))
+
+
+def gives_orders_as_another(scene: Scene) -> bool:
+    """As another operator, as nobody, or to all runs at once."""
+    keys_of_others = [keys.orders("r", name) for name in ("alice", keys.NO_OPERATOR, "*")]
+    return any(scene.answered(key) for key in keys_of_others)
+
+
+def drains_waiting_actors(scene: Scene) -> bool:
+    """An actor that waits for a run shows itself, and an operator reaches it."""
+    news: list[bytes] = []
+    waiting = keys.presence(keys.NO_RUN, "box", 7)
+    inbox = scene.actor.subscribe(keys.orders(keys.NO_RUN, "*"), lambda: news.append(inbox.take() or b""))
+    scene.actor.declare_presence(waiting)
+    scene.until_heard(lambda: None, lambda: waiting in scene.learner.present(keys.presence(keys.NO_RUN, "*", "*")))
+    sees = waiting in scene.own.present(keys.presence(keys.NO_RUN, "*", "*"))
+    scene.until_heard(
+        lambda: scene.learner.publish(keys.orders(keys.NO_RUN, "learner"), b"first"), lambda: b"first" in news
+    )
+    scene.own.publish(keys.orders(keys.NO_RUN, scene.name), b"second")
+    scene.own.query(keys.join("r", scene.name), timeout=scene.patience)
+    scene.until_heard(
+        lambda: scene.learner.publish(keys.orders(keys.NO_RUN, "learner"), b"third"), lambda: b"third" in news
+    )
+    return sees and b"second" in news
 
 
 OPERATIONS = (
@@ -195,8 +215,9 @@ OPERATIONS = (
     answers_status,
     watches_presence,
     reads_the_status,
-    drains,
     gives_orders,
+    gives_orders_as_another,
+    drains_waiting_actors,
 )
 PLAYS = {joins, uploads_as_itself, reads_publications}
 ALLOWED = {
@@ -204,7 +225,7 @@ ALLOWED = {
     "actor": PLAYS,
     "one of an actor's host": PLAYS,
     "another actor": PLAYS,
-    "operator": {watches_presence, reads_the_status, drains, gives_orders},
+    "operator": {watches_presence, reads_the_status, gives_orders, drains_waiting_actors},
 }
 
 

@@ -24,9 +24,10 @@ from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.transport import connecting, zenoh_settings, zenoh_transport
 from daedalus.transport import retries as retries_module
 from daedalus.transport.credentials import load
-from daedalus.transport.interface import Request
+from daedalus.transport.interface import Request, UnreachableError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall, in_progress
+from daedalus.transport.zenoh_session import no_answer
 from daedalus.transport.zenoh_settings import Capacity
 from daedalus.transport.zenoh_transport import connect, listen
 
@@ -50,7 +51,7 @@ def test_messages_above_the_limit_are_dropped_and_the_session_goes_on() -> None:
     assert sizes == [MIB // 2, 0]
 
 
-@pytest.mark.parametrize("key", [keys.join("r", "arm"), keys.reports("r", "arm"), keys.orders("r")])
+@pytest.mark.parametrize("key", [keys.join("r", "arm"), keys.reports("r", "arm"), keys.orders("r", "alice")])
 def test_small_queries_are_filtered_by_their_size(key: str) -> None:
     """A router does not forward 400 MB to a learner in a request to join."""
     endpoint, router = listen_somewhere()
@@ -167,6 +168,32 @@ def test_stop_ends_an_attempt_to_connect_and_a_late_transport_is_closed(
     assert not closed.is_set()
     released.set()
     assert closed.wait(LIMIT)
+
+
+def test_a_host_that_drops_packets_is_named_within_seconds_and_the_timeout_holds(
+    released: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh needs 10 s for each attempt: none of them is waited for."""
+    attempts: list[float] = []
+
+    def connect(*_: Any, **__: Any) -> SimpleNamespace:
+        attempts.append(time.monotonic())
+        assert released.wait(LIMIT)
+        return SimpleNamespace(close=lambda: None)
+
+    monkeypatch.setattr(connecting, "connect", connect)
+    monkeypatch.setattr(connecting, "_SILENT_SECONDS", 0.0)
+    monkeypatch.setattr(connecting, "_QUIET_SECONDS", 0.0)
+    where = ["tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"]
+    with pytest.raises(UnreachableError, match=rf"no answer from {' or '.join(where)}: .* firewall .*tried for 1 s"):
+        connecting.connect_with_retry(where, threading.Event(), 1.0)
+    assert [line for line in LINES if "no answer" in line] == [f"{no_answer(where)}; waiting for it"]
+    with pytest.raises(UnreachableError, match=r"no answer from .*tried for 0\.1 s"):
+        connecting.connect_once(where, timeout=0.1)
+    monkeypatch.setattr(connecting, "_ONCE_SECONDS", 0.2)
+    with pytest.raises(UnreachableError, match=r"tried for 0\.2 s"):
+        connecting.connect_once(where)
+    assert len(attempts) == 3
 
 
 def test_transport_whose_session_does_not_close_is_given_up(

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -19,21 +19,31 @@ from daedalus.learner.reporting.trackers.tracker import TRACKERS, OpenTracker, T
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY, TRACKER, read_json, write_json
 from daedalus.learner.run.settings import SettingsError, read_settings
 
+_UNKNOWN = 1e300  # seconds, later than any row
+
 
 @dataclass(slots=True, kw_only=True)
 class TrackingState:
     """State of one tracker between two processes."""
 
     id: str = ""  # the tracker's id of the run; empty before the first start
-    rows: int = 0  # rows of metrics.csv that need no further attention
-    env_steps: int = -1  # of the newest row that was logged
+    # Of the newest row that was logged. An earlier release did not keep the last two.
+    env_steps: int = -1
+    wall_seconds: float = 0.0
+    evaluation_env_steps: int = -1  # of the newest evaluation that was logged
 
     @classmethod
     def load(cls, directory: Path, name: str) -> Self:
         """Read the state of a tracker; a missing or damaged file is a new state."""
         try:
             content = read_json(_path(directory, name))
-            return cls(id=str(content["id"]), rows=int(content["rows"]), env_steps=int(content["env_steps"]))
+            env_steps = int(content["env_steps"])
+            return cls(
+                id=str(content["id"]),
+                env_steps=env_steps,
+                wall_seconds=float(content.get("wall_seconds", _UNKNOWN)),
+                evaluation_env_steps=int(content.get("evaluation_env_steps", env_steps)),
+            )
         except (SettingsError, KeyError, TypeError, ValueError):
             return cls()
 
@@ -57,16 +67,14 @@ def _path(directory: Path, name: str) -> Path:
 class MetricsFollower:
     """Reader of the complete rows of a metrics.csv that grows. It keeps no file open between two calls.
 
-    If a row has new columns, the writer of the file writes it anew, with all rows so far. A resumed run writes it anew
-    without the rows after its checkpoint, and appends rows that begin again there.
+    The file is written anew with new columns, with old rows merged, and, by a resumed run, without the rows after its
+    checkpoint. Its rows are then read again from the first one on.
     """
 
-    def __init__(self, path: Path, taken: int = 0) -> None:
-        """Construct the reader. `taken` is the number of rows to leave out at the beginning."""
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self.taken = taken  # number of rows that were read, and whose use has ended without an exception
         self._header = b""
-        self._at = 0  # bytes, after the rows that were taken
+        self._at = 0  # bytes, after the rows whose use has ended without an exception
         self._last = b""  # line before there
 
     @property
@@ -75,7 +83,10 @@ class MetricsFollower:
         return self._path.exists()
 
     def rows(self) -> Iterator[dict[str, float]]:
-        """Yield the rows since those that were taken. A damaged row is empty. Raises OSError."""
+        """Yield the rows since the last call, or all of a file that was written anew. A damaged row is empty.
+
+        Raises OSError.
+        """
         if not self.exist:
             return
         with open(self._path, "rb") as file:
@@ -83,16 +94,13 @@ class MetricsFollower:
             if not header.endswith(b"\n"):
                 return
             if header != self._header or not self._is_at_last(file):
-                file.seek(len(header))
-                lines = [line for _, line in zip(range(self.taken), file, strict=False) if line.endswith(b"\n")]
-                self._header, self._at = header, len(header) + sum(map(len, lines))
-                self._last, self.taken = (lines or [header])[-1], len(lines)
+                self._header = self._last = header
+                self._at = len(header)
             columns = _cells(header)
             file.seek(self._at)
             while (line := file.readline()).endswith(b"\n"):
                 row = numbers(columns, _cells(line))
                 yield row if "env_steps" in row else {}
-                self.taken += 1
                 self._at += len(line)
                 self._last = line
 
@@ -112,7 +120,7 @@ def _cells(line: bytes) -> list[str]:
 _POLL_SECONDS = 1.0
 _RETRY_SECONDS = 60.0  # after the tracker failed
 _SLOW_SECONDS = 60.0  # for one call, before the user is warned
-_ROWS_A_SAVE = 100  # of the state, when many rows are new
+_SECONDS_A_SAVE = 10.0  # of the state, while many rows are new
 _LONGEST_FAULT = 300  # characters
 
 _logger = logging.getLogger(__name__)
@@ -136,7 +144,7 @@ class Tracking:
         """
         self._name, self._directory, self._open, self._finish = name, directory, open_tracker, finish
         self._state = TrackingState.load(directory, name)
-        self._rows = MetricsFollower(directory / METRICS, self._state.rows)
+        self._rows = MetricsFollower(directory / METRICS)
         self._tracker: Tracker | None = None
         self._evaluation: dict[str, float] = {}  # of rows that were left out
         self._warned = False
@@ -171,25 +179,31 @@ class Tracking:
             return
         if self._tracker is None:
             self._tracker = self._opened()
+        before, save_at = replace(self._state), time.monotonic() + _SECONDS_A_SAVE
         try:
             for row in self._rows.rows():
                 self._log_row(self._tracker, row)
-                if self._rows.taken >= self._state.rows + _ROWS_A_SAVE:
+                if time.monotonic() >= save_at:
+                    save_at = time.monotonic() + _SECONDS_A_SAVE
                     self._save()
         finally:
-            if self._rows.taken != self._state.rows:
+            if self._state != before:
                 self._save()
         if last:
             self._tracker.summarize(_summary(self._directory))
             self._tracker.close()
 
     def _log_row(self, tracker: Tracker, row: dict[str, float]) -> None:
-        """Log a row, unless the tracker has received later ones."""
-        if row and row["env_steps"] >= self._state.env_steps:
-            tracker.write({**self._evaluation, **row}, Details())
-            self._state.env_steps, self._evaluation = int(row["env_steps"]), {}
+        """Log a row, unless the tracker has received it or later ones."""
+        state = self._state
+        if (row.get("env_steps", -1), row.get("wall_seconds", 0.0)) > (state.env_steps, state.wall_seconds):
+            row = {**self._evaluation, **row}
+            tracker.write(row, Details())
+            state.env_steps, state.wall_seconds = int(row["env_steps"]), row.get("wall_seconds", 0.0)
+            state.evaluation_env_steps = int(row.get("evaluation_env_steps", state.evaluation_env_steps))
+            self._evaluation = {}
             self._call_began = time.monotonic()  # each row has its time
-        else:
+        elif row.get("evaluation_env_steps", -1) > state.evaluation_env_steps:
             self._evaluation |= {name: row[name] for name in GROUPS["evaluation"] if name in row}
 
     def _opened(self) -> Tracker:
@@ -201,7 +215,6 @@ class Tracking:
         return tracker
 
     def _save(self) -> None:
-        self._state.rows = self._rows.taken
         with suppress(OSError):  # the learner reports a full disk
             self._state.save(self._directory, self._name)
 
@@ -210,7 +223,7 @@ class Tracking:
             with suppress(Exception):
                 self._tracker.close()
             self._tracker = None
-            self._rows = MetricsFollower(self._directory / METRICS, self._rows.taken)
+            self._rows = MetricsFollower(self._directory / METRICS)
 
     @contextmanager
     def _timed(self) -> Iterator[None]:
