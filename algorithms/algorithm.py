@@ -24,7 +24,7 @@ class Losses(NamedTuple):
     """Terms of the loss of one update before they are weighted and summed, and the inputs of its metrics.
 
     The loss of the update is policy_loss + value_coefficient * L(values, targets) - entropy_bonus * mean(entropies),
-    where L is `training.value_loss` and both means are over the valid rows.
+    where L is `training.value_loss`, or the given `value_loss`, and both means are over the valid rows.
     """
 
     policy_loss: Tensor  # scalar
@@ -34,6 +34,7 @@ class Losses(NamedTuple):
     shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
     clipped_fraction: Tensor | None = None  # scalar, share of rows whose probability ratio was clipped; None: no clip
     first_pass: FirstPass | None = None  # of the whole batch, for its diagnostics; the same object in all updates
+    value_loss: Tensor | None = None  # scalar; None: the mean of `training.value_loss` of values and targets
 
 
 class MinibatchLosses(NamedTuple):

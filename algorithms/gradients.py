@@ -121,7 +121,9 @@ class GradientComputer:
     def _differentiated(self, losses: Losses, bonus: Tensor) -> tuple[Tensor, ...]:
         """Return the gradient [P] of the weighted sum of losses, and their Terms."""
         _check_shapes(losses)
-        value_term = value_loss(losses.values, losses.targets, losses.shares, self._spec.value_loss)
+        value_term = losses.value_loss
+        if value_term is None:
+            value_term = value_loss(losses.values, losses.targets, losses.shares, self._spec.value_loss)
         entropy = mean(losses.entropies, losses.shares)
         loss = losses.policy_loss + self._spec.value_coefficient * value_term - bonus * entropy
         clipped = entropy.new_zeros(()) if losses.clipped_fraction is None else losses.clipped_fraction
@@ -166,8 +168,12 @@ def _check_shapes(losses: Losses) -> None:
         if not isinstance(term := getattr(losses, name), Tensor):
             zero = "torch.zeros(())" if name == "policy_loss" else "torch.zeros_like(shares)"
             raise TypeError(f"{name} is {type(term).__name__}: it must be a tensor; zero is {zero}")
-    if losses.policy_loss.shape:
-        raise ValueError(f"policy_loss has shape {tuple(losses.policy_loss.shape)}: it must be a scalar")
+    if losses.value_loss is not None and not isinstance(losses.value_loss, Tensor):
+        raise TypeError(f"value_loss is {type(losses.value_loss).__name__}: it must be a tensor, or None")
+    for name in ("policy_loss", "value_loss"):
+        term = getattr(losses, name)
+        if term is not None and term.shape:
+            raise ValueError(f"{name} has shape {tuple(term.shape)}: it must be a scalar")
     shapes = [tuple(each.shape) for each in (losses.entropies, losses.values, losses.targets, losses.shares)]
     if len(set(shapes)) > 1:
         raise ValueError(f"the shapes of entropies, values, targets and shares differ: {shapes}")

@@ -28,6 +28,7 @@ class Minibatch:
     actions: Components  # each [R, B, D]
     masks: Components  # of the masked actions [R, B, choices] bool
     log_probs: Tensor  # [R, B], log-probabilities of the proximal policy
+    values: Tensor  # [R, B], of the network before the first pass
     targets: Tensor  # [R, B], value targets
     factors: Tensor  # [R, B], of the rows in the policy loss
     shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
@@ -50,10 +51,12 @@ class Minibatch:
 
 
 _MAPS = ("observations", "actions", "masks")
-_ARRAYS = ("initial_state", "starts", "log_probs", "targets", "factors", "shares")
+_ARRAYS = ("initial_state", "starts", "log_probs", "values", "targets", "factors", "shares")
 
 
-def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
+def minibatches(
+    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, count: int
+) -> Iterator[Minibatch]:
     """Return one shuffled pass over a batch as `count` minibatches of nearly equal size.
 
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
@@ -63,16 +66,17 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
 
     Args:
       log_probs: [T, B], log-probabilities of the actions under the proximal policy.
+      values: [T, B], of the network before the first pass.
       targets: [T, B], value targets.
       factors: [T, B], of the rows in the policy loss.
       count: largest number of minibatches.
     """
     split = _by_environment if batch.initial_state.shape[1] else _by_row
-    return split(batch, log_probs, targets, factors, count)
+    return split(batch, log_probs, values, targets, factors, count)
 
 
 def _by_environment(
-    batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int
+    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, count: int
 ) -> Iterator[Minibatch]:
     order = torch.randperm(batch.valid.shape[1]).to(batch.valid.device)
     for part in order.tensor_split(min(count, len(order))):
@@ -83,13 +87,16 @@ def _by_environment(
             actions=map_components(batch.actions, partial(_columns, part=part)),
             masks=map_components(batch.masks, partial(_columns, part=part)),
             log_probs=log_probs[:, part],
+            values=values[:, part],
             targets=targets[:, part],
             factors=factors[:, part],
             shares=shares_of(batch.valid[:, part]),
         )
 
 
-def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
+def _by_row(
+    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, count: int
+) -> Iterator[Minibatch]:
     rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
     order = rows[torch.randperm(len(rows)).to(rows.device)]
     number = min(count, len(order))
@@ -115,9 +122,9 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
     small = {name: parts_of(values) for name, values in batch.observations.items() if name not in large}
     actions = {name: parts_of(values) for name, values in batch.actions.items()}
     masks = {name: parts_of(values) for name, values in batch.masks.items()}
-    arrays = [parts_of(values) for values in (batch.starts, log_probs, targets, factors)]
+    arrays = [parts_of(values) for values in (batch.starts, log_probs, values, targets, factors)]
     for index, part in enumerate(filled):
-        starts, own_log_probs, own_targets, own_factors = (parts[index] for parts in arrays)
+        starts, own_log_probs, own_values, own_targets, own_factors = (parts[index] for parts in arrays)
         gathered = map_components(large, partial(_rows, rows=part))
         yield Minibatch(
             observations={name: parts[index] for name, parts in small.items()} | gathered,
@@ -126,6 +133,7 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
             actions={name: parts[index] for name, parts in actions.items()},
             masks={name: parts[index] for name, parts in masks.items()},
             log_probs=own_log_probs,
+            values=own_values,
             targets=own_targets,
             factors=own_factors,
             shares=shares[len(split[index])],

@@ -102,7 +102,7 @@ class Appo(Algorithm):
         behaviour = self.spec.proximal_policy == "behaviour" and not self.spec.explores
         proximal = batch.behaviour_log_probs if behaviour else log_probs
         for _ in range(self.spec.passes):
-            for minibatch in minibatches(batch, proximal, targets.values, factors, self.spec.minibatches):
+            for minibatch in minibatches(batch, proximal, values[:-1], targets.values, factors, self.spec.minibatches):
                 yield MinibatchLosses(self._minibatch_losses, minibatch, first_pass)
 
     def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:
@@ -118,4 +118,16 @@ class Appo(Algorithm):
             targets=minibatch.targets,
             shares=shares,
             clipped_fraction=clipped,
+            value_loss=self.value_loss(minibatch, values),
         )
+
+    def value_loss(self, minibatch: Minibatch, values: Tensor) -> Tensor | None:
+        """Return the value loss of a minibatch, a scalar; None: the one that `training.value_loss` names.
+
+        For subclasses.
+
+        Args:
+          minibatch: has the values of the network before the first pass, and the value targets, [R, B].
+          values: [R, B], those of the network now.
+        """
+        return None

@@ -151,13 +151,15 @@ _STYLE: dict[Any, Any] = {
     **{f"axes.spines.{side}": False for side in ("left", "right", "top", "bottom")},
     **{f"{axis}tick.major.size": 0.0 for axis in "xy"},
 }
-_WIDTH, _HEIGHT = 520 / 72, 220 / 72  # inches of 72 points, the unit of the SVG
+_WIDTH, _HEIGHT, _WIDE, _HIGH = 520 / 72, 220 / 72, 1200 / 72, 380 / 72  # inches of 72 points, the unit of the SVG
 _METADATA = ("Creator", "Date", "Format", "Type")  # is left out
 _MOST_POINTS = 400
 _MOST_BINS = 40
 
 
-def line_chart(title: str, series: Sequence[Series], *, unit: str, colours: Sequence[int]) -> ET.Element:
+def line_chart(
+    title: str, series: Sequence[Series], *, unit: str, colours: Sequence[int], wide: bool = False
+) -> ET.Element:
     """Return a chart of lines as an element `svg`.
 
     Args:
@@ -165,12 +167,13 @@ def line_chart(title: str, series: Sequence[Series], *, unit: str, colours: Sequ
       series: the lines, each with at least one point.
       unit: of the horizontal axis.
       colours: the colour of each line, from 0 on.
+      wide: for the width of a page, and not of a column.
     """
     ends = "; ".join(
         f"{each.name + ': ' if len(series) > 1 else ''}from {written(float(each.y[0]))} to {written(float(each.y[-1]))}"
         for each in series[:SERIES_COLOURS]
     )
-    with _chart(title, f"{title} by {unit}: {ends}", unit) as (axis, svg):
+    with _chart(title, f"{title} by {unit}: {ends}", unit, wide=wide) as (axis, svg):
         for each, colour in zip(series, colours, strict=True):
             style = "-" if colour < SERIES_COLOURS else "--"
             _draw(axis, _thinned(each), _PLACEHOLDERS[f"--series-{colour % SERIES_COLOURS + 1}"], style=style)
@@ -194,13 +197,13 @@ def histogram(title: str, values: np.ndarray, *, marks: Sequence[tuple[str, floa
 
 
 @contextmanager
-def _chart(title: str, description: str, unit: str) -> "Iterator[tuple[Axes, ET.Element]]":
+def _chart(title: str, description: str, unit: str, *, wide: bool = False) -> "Iterator[tuple[Axes, ET.Element]]":
     """Give an axis to draw on, and the element that has the chart at the end."""
     import matplotlib
 
     svg, file = ET.Element("svg"), io.StringIO()
     with matplotlib.rc_context({**_STYLE, "svg.hashsalt": title}):  # the names in two charts of a page must differ
-        figure = _figure(_WIDTH, _HEIGHT)
+        figure = _figure(_WIDE, _HIGH) if wide else _figure(_WIDTH, _HEIGHT)
         axis = figure.subplots()
         axis.set_xlabel(unit, loc="right")
         yield axis, svg

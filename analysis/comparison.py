@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.analysis.recorded_run import record_command
 from daedalus.analysis.run_groups import Group, environment_of, text
 from daedalus.analysis.statistics import (
     Strata,
@@ -123,7 +122,7 @@ def incomparable_returns(groups: Sequence[Group]) -> str:
     return (
         "final returns cannot be compared: training plays different tasks (environment.training_kwargs or "
         "environment.no_reward_limit) and not all runs were evaluated; evaluate them, such as with: "
-        f"{record_command(without[0].directory)}"
+        f"{without[0].record_command}"
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.analysis.model_card import model_card
-from daedalus.analysis.recorded_run import SECONDS, RunRecord, one_run, read_record, record_command
+from daedalus.analysis.recorded_run import SECONDS, RunRecord, one_run, read_record
 from daedalus.learner.reporting.trackers.tracker import flat
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, METRICS, VERSIONS
 from daedalus.learner.run.run_files import RunDataError
@@ -119,7 +119,7 @@ def _texts(directory: Path, names: Iterable[str]) -> dict[str, bytes]:
 
 def _with_matching_evaluation(record: RunRecord, policy: SavedPolicy) -> RunRecord:
     """Return the record, without the evaluation of another policy of the run."""
-    evaluation, how = record.evaluation, record_command(record.directory)
+    evaluation, how = record.evaluation, record.record_command
     if evaluation is None:
         _logger.warning("no evaluation is recorded, and the model card has no results; before the push: %s", how)
     elif evaluation.policy_version != policy.policy_version:

@@ -26,7 +26,8 @@ from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.policy.user_modules import allow_settings
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.texts import bounded_text, without_secrets
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
@@ -79,11 +80,27 @@ class RecordedRun:
         if ended and (steps is None or done <= steps):
             return ""
         running = is_locked(self.directory)
-        command = f"daedalus resume {shlex.quote(str(self.directory))}"
-        remedy = "it is still running" if running else f"continue it with: {command}"
+        remedy = "it is still running" if running else f"continue it with: {self.resume_command}"
         author = self.summary.get("stopped_by")
         stopped = f", stopped by {bounded_text(author)}" if isinstance(author, str) and not running else ""
         return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps){stopped}: {remedy}"
+
+    @property
+    def resume_command(self) -> str:
+        """Command that continues the run."""
+        modules = {} if self.spec is None else self.spec.user_modules
+        return shlex.join(["daedalus", "resume", str(self.directory), *allow_settings(modules)])
+
+    @property
+    def evaluate_command(self) -> str:
+        """Command that evaluates the run."""
+        modules = {} if self.environment is None else self.environment.user_modules
+        return shlex.join(["daedalus", "evaluate", str(self.directory), *allow_settings(modules)])
+
+    @property
+    def record_command(self) -> str:
+        """Command that evaluates the run and records the result in its directory."""
+        return f"{self.evaluate_command} --record"
 
     @property
     def evaluation_return(self) -> float | None:
@@ -101,6 +118,18 @@ class RecordedRun:
     def target(self) -> float | None:
         """The target return of the run, or None."""
         return self.settings.get("training.target_return")
+
+    @property
+    def spec(self) -> RunSpec | None:
+        """The settings; None if this release does not know them."""
+        sections: dict[str, dict[str, Any]] = {}
+        for key, value in self.settings.items():
+            section, _, name = key.partition(".")
+            sections.setdefault(section, {})[name] = value
+        try:
+            return RunSpec.model_validate(sections)
+        except ValidationError:
+            return None
 
     @property
     def environment(self) -> EnvironmentSpec | None:
@@ -209,12 +238,25 @@ def _settings(path: Path) -> dict[str, Any]:
         settings = run_spec(settings).model_dump(mode="json")
     except SettingsError:  # another release may have had settings that this one does not have
         settings = json.loads(json.dumps(settings, default=str))  # TOML has dates, too
+    return {path: value for path, value in _flat(settings).items() if _is_usable(path, value)}
+
+
+def default_settings_of(run: RecordedRun) -> dict[str, Any]:
+    """Return the default of each setting that has one, by `section.key`; empty for an environment without a name."""
+    try:
+        spec = RunSpec.model_validate({"environment": {"id": run.settings.get(ENVIRONMENT)}})
+    except ValidationError:
+        return {}
+    return {path: value for path, value in _flat(spec.model_dump(mode="json")).items() if path != ENVIRONMENT}
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of all sections by `section.key`."""
     return {
         f"{section}.{key}": value
         for section, values in settings.items()
         if isinstance(values, dict)
         for key, value in values.items()
-        if _is_usable(f"{section}.{key}", value)
     }
 
 
@@ -233,11 +275,6 @@ def _summary(path: Path) -> dict[str, Any]:
         if not _is_number(content.get(name)):
             raise RunDataError(f"{path} is damaged: {name} is not a number")
     return content
-
-
-def record_command(directory: Path) -> str:
-    """Return the command that evaluates a run and records the result in its directory."""
-    return f"daedalus evaluate {shlex.quote(str(directory))} --record"
 
 
 def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
@@ -407,7 +444,7 @@ def _evaluation(run: RecordedRun) -> RecordedEvaluation | None:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise RunDataError(
-            f"{path} is damaged ({where}: {first['msg']}): write it again with: {record_command(run.directory)}"
+            f"{path} is damaged ({where}: {first['msg']}): write it again with: {run.record_command}"
         ) from None
 
 

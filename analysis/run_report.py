@@ -8,7 +8,7 @@ import base64
 import math
 import shlex
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ import numpy as np
 from daedalus.analysis.charts import SERIES_COLOURS, histogram, line_chart
 from daedalus.analysis.comparison import Comparison, cells, compare_groups, header, notes
 from daedalus.analysis.learning_curves import LARGEST, series_of
-from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite, record_command
+from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, default_settings_of, finite
 from daedalus.analysis.run_groups import Group, environment_of, text
 from daedalus.analysis.run_results import (
     EpisodeStatistics,
@@ -197,7 +197,7 @@ def evaluation_section(record: RunRecord) -> ET.Element:
     if evaluation is None:
         how = [
             "No evaluation is recorded. Evaluate the run with: ",
-            element("code", record_command(record.directory)),
+            element("code", record.record_command),
         ]
         return section("Evaluation", element("p", how, class_="note"))
     statistics = episode_statistics(evaluation)
@@ -220,7 +220,7 @@ def _returns(record: RunRecord, statistics: EpisodeStatistics) -> ET.Element:
     assert record.evaluation is not None
     if statistics.interquartile is None:
         how = "The returns of the episodes are not recorded, so there is no histogram. Evaluate the run again with: "
-        return element("p", how, element("code", record_command(record.directory)), class_="note")
+        return element("p", how, element("code", record.record_command), class_="note")
     returns = np.array(record.evaluation.returns)
     if not (np.abs(returns) < LARGEST).all():
         return element("p", "The returns are too large for a histogram.", class_="note")
@@ -308,18 +308,32 @@ def failure_section(record: RunRecord) -> ET.Element:
 
 
 def settings_section(record: RunRecord) -> ET.Element:
-    """Return all settings of the run, by their sections."""
-    parts: dict[str, list[tuple[str, str]]] = {}
+    """Return the settings of the run that are not the defaults, by their sections, and the others collapsed."""
+    defaults = default_settings_of(record)
+    chosen, others = {}, {}
     for path, value in record.settings.items():
+        if path not in defaults or value != defaults[path]:
+            chosen[path] = "unset" if value is None else setting_text(value)
+        elif value is not None:
+            others[path] = setting_text(value)
+    summary = element("summary", f"{len(others)} settings with their default values")
+    return section(
+        "Settings",
+        _settings_columns(chosen, "settings") if chosen else None,
+        element("details", summary, _settings_columns(others, "default settings")) if others else None,
+    )
+
+
+def _settings_columns(settings: Mapping[str, str], label: str) -> ET.Element:
+    parts: dict[str, list[tuple[str, str]]] = {}
+    for path, value in settings.items():
         part, _, name = path.partition(".")
-        if value is not None:
-            parts.setdefault(part, []).append((name, setting_text(value)))
+        parts.setdefault(part, []).append((name, value))
     columns = [
-        element("div", element("h3", part), table((), rows, label=f"settings: {part}"), class_="card")
+        element("div", element("h3", part), table((), rows, label=f"{label}: {part}"), class_="card")
         for part, rows in parts.items()
-        if rows
     ]
-    return section("Settings", element("div", columns, class_="columns"))
+    return element("div", columns, class_="columns")
 
 
 def versions_section(record: RunRecord) -> ET.Element | None:
@@ -331,9 +345,8 @@ def versions_section(record: RunRecord) -> ET.Element | None:
 
 def repeat_section(record: RunRecord) -> ET.Element:
     """Return the commands that train and evaluate the same again."""
-    config, directory = (shlex.quote(str(path)) for path in (record.directory / CONFIG, record.directory))
-    commands = f"daedalus train {config}\ndaedalus evaluate {directory}"
-    return section("Do it again", element("pre", commands, tabindex=0))
+    train = shlex.join(["daedalus", "train", str(record.directory / CONFIG)])
+    return section("Do it again", element("pre", f"{train}\n{record.evaluate_command}", tabindex=0))
 
 
 def comparison_of(groups: Sequence[Group], threshold: float | None) -> Comparison | None:
@@ -353,7 +366,9 @@ def comparison_section(comparison: Comparison | None) -> ET.Element:
     explained = [element("li", line) for line in notes(comparison)]
     return section(
         "Comparison",
-        table(header(comparison), rows, label="comparison of the groups", numeric=range(1, 7)),
+        table(
+            header(comparison), rows, label=f"comparison of the groups of {comparison.environment}", numeric=range(1, 7)
+        ),
         element("ul", explained, class_="muted"),
     )
 
@@ -379,7 +394,7 @@ def runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element:
                     failures or "none",
                 )
             )
-    return section("Runs", table(head, rows, label="runs", numeric=(2, 4, 5, 6, 7)))
+    return section("Runs", table(head, rows, label=f"runs of {environment_of(groups)}", numeric=(2, 4, 5, 6, 7)))
 
 
 def _evaluated(record: RunRecord) -> str:
@@ -396,7 +411,7 @@ def differences_section(groups: Sequence[Group]) -> ET.Element | None:
     if not rows:
         return None
     head = ("setting", *(group.name for group in groups))
-    return section("Settings that differ", table(head, rows, label="settings that differ"))
+    return section("Settings that differ", table(head, rows, label=f"settings of {environment_of(groups)} that differ"))
 
 
 def _values(group: Group, key: str) -> str:
@@ -436,7 +451,8 @@ def _curves(groups: Sequence[Group], by: str, of: str = "") -> ET.Element:
         if any(column == RETURN or series.y.any() for series, _ in found):  # all 0: nothing of the kind happened
             lines, colours = zip(*found, strict=True)
             name = f"{of}: {title}" if of else title
-            charts.append(_figure(title, line_chart(name, lines, unit=by, colours=colours)))
+            chart = line_chart(name, lines, unit=by, colours=colours, wide=column == RETURN)
+            charts.append(_figure(title, chart, wide=column == RETURN))
     return section(
         "Learning curves",
         element("p", band, class_="muted"),
@@ -459,8 +475,8 @@ def _legend(keys: Iterable[tuple[str, int, bool]]) -> ET.Element:
     return element("ul", items, class_="legend")
 
 
-def _figure(title: str, chart: ET.Element) -> ET.Element:
-    return element("figure", element("figcaption", title), chart, class_="chart")
+def _figure(title: str, chart: ET.Element, *, wide: bool = False) -> ET.Element:
+    return element("figure", element("figcaption", title), chart, class_="chart wide" if wide else "chart")
 
 
 def _header(title: str, facts: Sequence[object], status: str | None) -> ET.Element:

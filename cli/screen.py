@@ -5,7 +5,6 @@ Rich is imported with the first frame: a run starts without it, and does without
 
 import importlib.util
 import logging
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from daedalus.launch.local_run import RunObserver
 from daedalus.launch.logs import say
+from daedalus.launch.supervision import Child
 from daedalus.learner.reporting.progress import is_terminal
 from daedalus.protocol.texts import printable
 
@@ -134,7 +134,7 @@ class TrainingDisplay(RunObserver):
         """See RunObserver."""
         self._address = address
 
-    def poll(self, learner: subprocess.Popen[bytes]) -> bool:
+    def poll(self, learner: Child) -> bool:
         """See RunObserver. Start the display after the processes of the run."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._watch, name="display", daemon=True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from daedalus.analysis.recorded_run import read_metrics
     from daedalus.launch.callbacks import Callback, TrainingRun
     from daedalus.launch.evaluation import EvaluationResult, evaluate
-    from daedalus.launch.train_function import RunResult, TrainingError, train
+    from daedalus.launch.train_function import RunResult, TrainingError, resume, train
     from daedalus.learner.run.run_files import RunDataError
     from daedalus.learner.run.settings import SettingsError
     from daedalus.policy.saving.hub import HubError
@@ -46,6 +46,7 @@ __all__ = [
     "evaluate",
     "load_policy",
     "read_metrics",
+    "resume",
     "train",
 ]
 
@@ -67,6 +68,7 @@ _MODULES = {
     "evaluate": "daedalus.launch.evaluation",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
     "read_metrics": "daedalus.analysis.recorded_run",
+    "resume": "daedalus.launch.train_function",
     "train": "daedalus.launch.train_function",
 }
 

@@ -23,7 +23,7 @@ BEGIN, END = "<!-- generated -->", "<!-- end of generated -->"
 # What the page of the Python API describes, as `module.name`, or by its name in `daedalus`.
 PYTHON_API = {
     "Train": (
-        *("train", "RunResult", "Callback", "TrainingRun", "TrainingError", "SettingsError", "read_metrics"),
+        *("train", "resume", "RunResult", "Callback", "TrainingRun", "TrainingError", "SettingsError", "read_metrics"),
         "RunDataError",
     ),
     "Use a trained policy": (

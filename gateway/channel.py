@@ -38,6 +38,10 @@ class Channel(Protocol):
         """Send a message. Without effect once the connection ends."""
         ...
 
+    def acknowledge(self) -> None:
+        """Acknowledge what has come at once. For a message without an answer: the client may wait to send the next."""
+        ...
+
     def pause(self, paused: bool) -> None:
         """Stop reading messages, or go on. Only after `divert`. Idempotent."""
         ...

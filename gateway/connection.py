@@ -168,9 +168,11 @@ class ClientConnection:
                     self._is_waiting = True
                 case Reward():
                     actor.reward(message.reward)
+                    self._channel.acknowledge()
                 case EndEpisode():
                     actor.end_episode(message)
                     self._state = TRANSITIONS[self._state, "end_episode"]
+                    self._channel.acknowledge()
         except ClientError as error:
             self._faults += 1
             if self._faults == _MAX_FAULTS:

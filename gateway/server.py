@@ -295,6 +295,13 @@ class OurWebSocket(WebSocketsSansIOProtocol):
                 self.conn.send_binary(data)
             self.transport.write(b"".join(self.conn.data_to_send()))
 
+    def acknowledge(self) -> None:
+        """See Channel. Without TCP_NODELAY a client's system sends a small message only when the last is acknowledged,
+        which ours delays by 40 ms.
+        """
+        with contextlib.suppress(OSError, AttributeError):  # a closed connection, or a system other than Linux
+            self.transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+
     def pause(self, paused: bool) -> None:
         """See Channel."""
         if paused != self.read_paused and not self.transport.is_closing():

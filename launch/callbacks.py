@@ -3,12 +3,12 @@
 import json
 import math
 import os
-import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from daedalus.launch.local_run import RunObserver
+from daedalus.launch.supervision import Child
 from daedalus.learner.reporting.user_metrics import MOST_METRICS
 from daedalus.policy.user_code import Surroundings
 from daedalus.protocol.keys import is_name
@@ -114,7 +114,7 @@ class CallbackObserver(RunObserver):
         with Surroundings():
             self._callback.on_end(self._run)
 
-    def poll(self, learner: subprocess.Popen[bytes]) -> bool:
+    def poll(self, learner: Child) -> bool:
         """See RunObserver. Pass new rows to the callback, and its metrics to the learner."""
         for line in self._lines():
             try:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from daedalus.launch.forked_process import fork as fork_process
+from daedalus.launch.forked_process import open_descriptors
 from daedalus.launch.process_lifecycle import interrupts_held
 from daedalus.policy.user_code import names_place
 from daedalus.policy.user_modules import UserModules, modules_of
@@ -99,7 +101,7 @@ def check_in_process(
         # Apple's frameworks do not work after a fork.
         forked = fork and sys.platform == "linux" and threading.active_count() == 1
         try:
-            pid = _forked(check, writing) if forked else _spawned(check, writing)
+            pid = _forked(check, writing) if forked or check.spec.is_from_python else _spawned(check, writing)
         finally:
             os.close(writing)
         try:
@@ -149,19 +151,17 @@ def _end(pid: int, *, own_group: bool) -> None:
 
 def _forked(check: EnvironmentCheck, writing: int) -> int:
     """Return the process id of a fork that writes the report to a descriptor."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    pid = os.fork()
-    if pid:
-        return pid
-    try:
+
+    def work() -> int:
         os.setpgid(0, 0)  # see _end
-        silent = os.open(os.devnull, os.O_RDWR)
-        for standard in range(3):
-            os.dup2(silent, standard)
         _report(check, writing)
+        return 0
+
+    silent = os.open(os.devnull, os.O_RDWR)
+    try:
+        return fork_process(work, (silent, silent, silent), open_descriptors())
     finally:
-        os._exit(1)  # nothing that belongs to the parent may be closed or flushed here
+        os.close(silent)
 
 
 def _spawned(check: EnvironmentCheck, writing: int) -> int:

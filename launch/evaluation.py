@@ -6,14 +6,15 @@ import os
 import re
 import sys
 import threading
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TextIO, get_args
+from typing import TYPE_CHECKING, Any, Literal, TextIO, get_args
 
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.given_environment import giving
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import (
@@ -24,6 +25,7 @@ from daedalus.actor.evaluation.episodes import (
     play_episodes,
 )
 from daedalus.actor.evaluation.video import FORMATS, Video
+from daedalus.launch.environment_object import NO_ENVIRONMENT, EnvironmentObject, environment_object
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import evaluation_result
 from daedalus.policy.saving.hub import pull
@@ -31,6 +33,9 @@ from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy, pretra
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of, refuse_while_imported
 from daedalus.protocol.spec import Backend, EnvironmentSpec
+
+if TYPE_CHECKING:
+    import gymnasium
 
 EPISODES = 100  # without a video or a window
 _MOST_EPISODES = 1_000_000  # their results are held in memory
@@ -53,6 +58,7 @@ class EvaluationOptions:
     envs: int | None = None  # environments that step together
     wrap: str | None = None  # in place of environment.wrap; "none": no wrapper
     allowed_modules: frozenset[str] = frozenset()
+    env: EnvironmentObject = NO_ENVIRONMENT  # that of the run, if it is passed again in Python
     video: Path | None = None
     width: int | None = None  # of the video
     max_seconds: float | None = None  # of the video
@@ -137,6 +143,7 @@ class EvaluationResult:
 def evaluate(
     directory: str | Path | None = None,
     *,
+    env: "gymnasium.Env | Callable[..., gymnasium.Env] | None" = None,
     newest: bool = False,
     pretrained: str | None = None,
     from_hub: str | None = None,
@@ -154,6 +161,8 @@ def evaluate(
 
     Args:
       directory: a run directory, or one of its checkpoints; of a run the best checkpoint, else the newest.
+      env: the environment, if `daedalus.train` played an object that no module has: its class, a function that returns
+        one, or an instance.
       newest: use the newest checkpoint of the run, not the best.
       pretrained: the name of a policy that ships with the package, in place of a directory.
       from_hub: USER/NAME of a policy on the Hugging Face Hub, in place of a directory.
@@ -177,6 +186,7 @@ def evaluate(
     for name, value, choices in (("actions", actions, ("greedy", "sampled")), ("backend", backend, get_args(Backend))):
         if value is not None and value not in choices:
             raise ValueError(f"{name} is {value!r}: choose from {', '.join(choices)}")
+    given = environment_object(env)
     options = EvaluationOptions(
         directory=None if directory is None else Path(directory),
         newest=newest,
@@ -190,7 +200,8 @@ def evaluate(
         video=None if video is None else Path(video),
         width=_whole_number("width", width),
         max_seconds=max_seconds,
-        allowed_modules=frozenset(allow_modules),
+        allowed_modules=frozenset({*allow_modules, *given.modules}),
+        env=given,
     )
     try:
         result = run_evaluation(options, threading.Event(), io.StringIO())
@@ -217,6 +228,18 @@ def _whole_number(name: str, value: object) -> int | None:
 def run_evaluation(options: EvaluationOptions, stop: threading.Event, stream: TextIO) -> dict[str, Any]:
     """Return the result of the evaluation that the options describe. `stream` shows its progress."""
     policy = find_policy(_directory(options), options.newest)
+    trained = policy.spec.environment.id
+    if not options.env.is_for(trained):
+        raise ValueError(f"env is {options.env.id}, and the policy was trained on {trained}: leave env out")
+    if options.env.maker is not None:
+        with giving(trained, options.env.maker):
+            return _evaluated(policy, options, stop, stream)
+    return _evaluated(policy, options, stop, stream)
+
+
+def _evaluated(
+    policy: SavedPolicy, options: EvaluationOptions, stop: threading.Event, stream: TextIO
+) -> dict[str, Any]:
     spec, modules = _environment(policy, options), _modules(policy, options)
     modules.check(spec.user_modules)
     seed = policy.spec.training.seed + 2**32 if options.seed is None else options.seed

@@ -138,6 +138,8 @@ def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
         except (ValueError, OSError, *SECURITY_ERRORS) as error:
             print_error("gateway", error)
             return BAD_USAGE
+    if chosen.serving is not None:
+        chosen.serving.watch_expiry()
     try:
         listener = _listen(host, port, options.or_any_port)
     except OSError as error:

@@ -136,6 +136,7 @@ class LearnerOptions:
     # From the program that has created the run directory and starts actors, trackers and evaluations itself:
     prepared: Path | None = None  # the run directory
     spaces: Spaces | None = None
+    player_at: str | None = None  # address where an evaluator waits to confirm the target
     rows_to: int | None = None  # pipe for each row of metrics
     supervised: bool = False
 
@@ -354,6 +355,10 @@ class LearnerProcess:
     @contextmanager
     def _player(self, run: ChosenRun, output: ChildOutput) -> Iterator[Player]:
         """Yield an evaluator of this host, for the new episodes that confirm the target. Raises TransportError."""
+        if self._options.player_at is not None:  # whoever started this learner has started it, too
+            with closing(listen([self._options.player_at])) as transport:
+                yield Player(transport, lambda: "")
+            return
         needed = modules_of(run.spec.environment.user_modules)
         allowed = allow_words(module for module in needed if module in run.modules.allowed)
         options = *helper_log_words(self._options.log), *allowed

@@ -1,7 +1,6 @@
 """The settings of one run on this machine, the command lines of its processes, who observes it, and how it ends."""
 
 import shlex
-import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.launch.logs import LogOptions
+from daedalus.launch.supervision import Child, StartPlayer, start
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spaces import Spaces
@@ -34,7 +34,7 @@ class RunObserver:
     def end(self) -> None:
         """Called after they have ended, in any way."""
 
-    def poll(self, learner: subprocess.Popen[bytes]) -> bool:
+    def poll(self, learner: Child) -> bool:
         """Do what is due, and return whether training has to end. Called many times a second."""
         return False
 
@@ -80,6 +80,8 @@ class LocalRun:
     clients: bool = False  # with the page, let clients take part
     log: Sequence[str] = ()  # trackers that the run is logged to
     observer: RunObserver = field(default_factory=RunObserver)
+    start_player: StartPlayer = start  # starts actors, evaluators and evaluations
+    player_address: str | None = None  # where an evaluator that this process has started waits for the learner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,8 @@ class RunEnd:
 
 def resume_command(run: LocalRun) -> str:
     """Return the command line that continues a run."""
+    if run.spec.environment.is_from_python:
+        return f"daedalus.resume({str(run.directory)!r}, env=...)  (in Python, with the environment again)"
     return shlex.join(["daedalus", "resume", str(run.directory), *allow_settings(run.spec.user_modules)])
 
 
@@ -115,6 +119,8 @@ def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
     arguments += allow_settings(run.spec.user_modules)  # with those of the environment, for the confirmation
     if run.spaces is not None:
         arguments += ["--spaces", run.spaces.model_dump_json()]
+    if run.player_address is not None:
+        arguments += ["--player-at", run.player_address]
     if run.init_from is not None:
         arguments += ["--init-from", str(run.init_from)]
     if run.resume or not first:

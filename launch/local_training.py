@@ -2,7 +2,6 @@
 
 import logging
 import os
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from daedalus.launch.process_lifecycle import FAILED, ORDERED, SUPERSEDED, UNSAV
 from daedalus.launch.supervision import (
     GATEWAY,
     LEARNER_GRACE_SECONDS,
+    Child,
     FailedError,
     Supervised,
     evaluators,
@@ -50,7 +50,8 @@ FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
 
 _POLL_SECONDS = 0.05
 _EVALUATOR = "evaluator"
-_HELPERS = {_EVALUATOR, GATEWAY}  # processes without which a run goes on
+_CONFIRMATION = "confirmation"
+_HELPERS = {_EVALUATOR, _CONFIRMATION, GATEWAY}  # processes without which a run goes on
 _SUMMARY_SECONDS = 30.0  # for the learner to write its summary after a callback ended training
 
 
@@ -66,6 +67,10 @@ def train(
 
     Adds the gateway to `page`, and starts the trackers. The caller ends them.
     """
+
+    def player(name: str, address: str, options: tuple[str, ...]) -> Supervised:
+        return supervised_actor(name, address, options, output.pipes, output.last_error, run.start_player)
+
     with _observed_address(run) as address:
         spec, options = run.spec, actor_arguments(run)
         learner = _supervised_learner(run, address, learner_streams)
@@ -73,7 +78,7 @@ def train(
         try:
             # One by one: if one cannot be started, those before it are stopped.
             for index in range(spec.collection.actors):
-                actors.append(supervised_actor(f"actor-{index}", address, options, output.pipes, output.last_error))
+                actors.append(player(f"actor-{index}", address, options))
             training = spec.training
             _logger.info(
                 "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
@@ -86,8 +91,10 @@ def train(
                 run.directory,
             )
             if spec.evaluation.seconds is not None:
-                evaluating = (*options, "--evaluator")
-                actors.append(supervised_actor(_EVALUATOR, address, evaluating, output.pipes, output.last_error))
+                actors.append(player(_EVALUATOR, address, (*options, "--evaluator")))
+            if run.player_address is not None:
+                waiting = (*options, "--evaluator", "--stay")
+                actors.append(player(_CONFIRMATION, run.player_address, waiting))
             # Of a run that was killed, or of whoever has sent this directory: it must not count.
             (run.directory / OPERATOR_TOKEN).unlink(missing_ok=True)
             if run.watch:
@@ -115,7 +122,7 @@ def _supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams) 
     """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
     descriptors = *run.lock, *run.observer.descriptors
 
-    def begin(first: bool) -> subprocess.Popen[bytes]:
+    def begin(first: bool) -> Child:
         arguments = learner_arguments(run, address, first=first)
         with open_streams("learner") as streams:
             return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
@@ -123,7 +130,7 @@ def _supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams) 
     return Supervised("the learner", begin, ended=FINISHED | {ORDERED, UNSAVED, SUPERSEDED})
 
 
-def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
+def _end(learner: Child, stopping: threading.Event) -> None:
     """End the learner, and wait until it has written its summary, which the evaluation reads."""
     learner.terminate()
     deadline = time.monotonic() + _SUMMARY_SECONDS
@@ -251,7 +258,7 @@ def evaluate_run(
             arguments = (str(run.directory), address, *run.logs.words())
             host = start("daedalus.launch.final_evaluation", *arguments, streams=streams, descriptors=run.lock)
         try:
-            with evaluators(address, names, options, output) as failure:
+            with evaluators(address, names, options, output, run.start_player) as failure:
                 while host.poll() is None:
                     if stopping.wait(_POLL_SECONDS):
                         raise RunStoppedError

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from socketserver import ThreadingMixIn
 from typing import Any, cast
@@ -21,15 +22,19 @@ from daedalus.launch.process_lifecycle import FAILED
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import Credentials
+from daedalus.transport.credentials import Credentials, certificate_days_left
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall
 from daedalus.transport.status_query import ask, newest_of_each_run
+from daedalus.transport.zenoh_session import PeerCertificate, peer_certificate
 
 _logger = logging.getLogger(__name__)
 
 _MAX_ACTORS = 1000  # of a run with series of their own
+_DAY = 86_400.0
+_LISTENER_SECONDS = 300.0  # between looks at the certificate of each listener
+_KEPT_SECONDS, _MAX_RUNS = 7 * _DAY, 1000  # what is remembered of the certificates of learners that have gone
 _REOPEN_SECONDS = 10.0  # after this time without an answer, a new session replaces the old one
 
 
@@ -134,12 +139,6 @@ _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], 
         "Age of the newest checkpoint.",
         lambda run: run.checkpoint_age_seconds,
     ),
-    (
-        GaugeMetricFamily,
-        "certificate_days_left",
-        "Days until the learner's certificate expires.",
-        lambda run: run.certificate_days_left,
-    ),
 )
 
 _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ...] = (
@@ -229,10 +228,55 @@ def _states(run: RunStatus) -> dict[str, int]:
     return {"alive": run.actors_alive, "quarantined": run.actors_quarantined, "gone": run.actors_gone}
 
 
+class CertificateDays:
+    """Days until the certificates of a network expire: of learners, of those that listen, and of this exporter."""
+
+    def __init__(self, endpoints: list[str], credentials: Credentials | None) -> None:
+        self._endpoints = [] if credentials is None else endpoints
+        self._credentials = credentials
+        self._learners: dict[str, tuple[float, float]] = {}  # by run: when it expires, and when the learner answered
+        self._listeners: dict[str, PeerCertificate] = {}  # by address
+
+    def follow(self, stop: threading.Event) -> None:
+        """Look at the certificates of the listeners from time to time, until `stop` is set."""
+        while self._credentials is not None:
+            for endpoint in self._endpoints:
+                found = peer_certificate(endpoint, self._credentials)
+                if found is not None:  # else the one seen last is the one that may have expired
+                    self._listeners[endpoint] = found
+            if stop.wait(_LISTENER_SECONDS if len(self._listeners) == len(self._endpoints) else _REOPEN_SECONDS):
+                return
+
+    def metric(self, runs: Iterable[RunStatus]) -> Metric:
+        """Return the days as one metric; those of a learner also for a week after it has gone."""
+        now = time.time()
+        for run in runs:
+            if run.certificate_days_left is not None:
+                self._learners.pop(run.run, None)
+                self._learners[run.run] = now + run.certificate_days_left * _DAY, now
+        self._learners = {
+            run: known for run, known in list(self._learners.items())[-_MAX_RUNS:] if now < known[1] + _KEPT_SECONDS
+        }
+        family = GaugeMetricFamily(
+            "daedalus_certificate_days_left",
+            "Days until a certificate expires; negative if it has expired.",
+            labels=["run", "role", "address"],
+        )
+        for run, (expires, _) in sorted(self._learners.items()):
+            family.add_metric([run, "learner", ""], (expires - now) / _DAY)
+        for endpoint, listener in sorted(self._listeners.items()):
+            family.add_metric(["", listener.common_name, endpoint], listener.validity.days_left())
+        if (own := certificate_days_left(self._credentials)) is not None:
+            family.add_metric(["", "exporter", ""], own)
+        return family
+
+
 class StatusCollector:
     """Collector that queries the learners at each scrape. The timeout of the query bounds the time of a scrape."""
 
-    def __init__(self) -> None:
+    def __init__(self, certificates: CertificateDays | None = None) -> None:
+        """Construct the collector. `certificates`: those to report besides the learners'."""
+        self._certificates = certificates or CertificateDays([], None)
         self.transport: Transport | None = None  # None until a router answers
         self.unanswered = False  # whether no learner answered the last scrape
         self._warned = False  # that not all actors have series
@@ -245,7 +289,8 @@ class StatusCollector:
                 statuses = ask(self.transport, max_actors=_MAX_ACTORS)
         self.unanswered = not statuses
         self._warn_of_large_fleet(statuses)
-        return metrics(statuses)
+        yield from metrics(statuses)
+        yield self._certificates.metric(newest_of_each_run(statuses))
 
     def _warn_of_large_fleet(self, statuses: list[RunStatus]) -> None:
         """Warn once if not all actors have series of their own."""
@@ -269,7 +314,8 @@ def serve_metrics(
 ) -> int:
     """Serve the status of the learners at a host and port until `stop` is set, and return the exit status."""
     host, port = listener
-    collector, registry = StatusCollector(), CollectorRegistry()
+    certificates = CertificateDays(endpoints, credentials)
+    collector, registry = StatusCollector(certificates), CollectorRegistry()
     registry.register(collector)
     try:
         server = MetricsServer(host, port, registry)
@@ -278,6 +324,7 @@ def serve_metrics(
         return FAILED
     thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
     thread.start()
+    threading.Thread(target=certificates.follow, args=(stop,), name="certificates", daemon=True).start()
     _logger.info("serving http://%s:%d/metrics", host, server.server_port)
     try:
         _follow(collector, endpoints, credentials, stop)

@@ -23,6 +23,7 @@ from daedalus.learner.run.settings import (
 )
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -38,6 +39,7 @@ class RunChoice:
     env_steps: int | None = None
     actors: int | None = None
     wrap: str | None = None
+    is_instance: bool = False  # whether `env` is one environment, which exists already
     assignments: Sequence[str] = ()  # further settings, each as SECTION.KEY=VALUE
     settings: Mapping[str, Any] = field(default_factory=dict)  # further settings, by SECTION.KEY
 
@@ -64,8 +66,17 @@ class RunChoice:
         if settings.get("policy", {}).get("memory", "none") != "none":
             for section, values in with_memory.items():
                 base.setdefault(section, {}).update(values)
-            settings = self._applied(base)
-        return run_spec(settings)
+        if self.is_instance:
+            _fit_one_environment(base, settings["training"]["algorithm"])
+        settings = self._applied(base)
+        spec = run_spec(settings)
+        if self.is_instance and (spec.collection.actors, spec.collection.envs_per_actor) != (1, 1):
+            raise SettingsError(
+                f"env is one instance, and {spec.collection.actors} actors with {spec.collection.envs_per_actor} "
+                "environments each need more: leave out actors and collection.envs_per_actor, or pass its class, or a "
+                "function that makes it"
+            )
+        return spec
 
     def directory(self, spec: RunSpec) -> Path:
         """Return the default run directory, named after the preset or file, or after the environment.
@@ -106,6 +117,15 @@ class RunChoice:
                 assign(settings, path, value)
             except SettingsError as error:
                 raise SettingsError(f"settings {path!r}: {error}") from None
+
+
+def _fit_one_environment(settings: dict[str, Any], algorithm: str) -> None:
+    """Change default settings, in place, so that the batches of one environment are as large as those of several."""
+    collection, record = settings["collection"], ALGORITHMS.get(algorithm)
+    rollouts = (record and record.batch_rollouts) or collection["actors"]
+    if record is None or not record.synchronous:
+        settings["training"]["batch_rollouts"] = rollouts * collection["envs_per_actor"]
+    collection |= {"actors": 1, "envs_per_actor": 1}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

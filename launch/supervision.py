@@ -10,8 +10,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Protocol
 
 from daedalus.launch.child_output import ChildOutput, OpenStreams, Streams, inherited
+from daedalus.launch.forked_process import ForkedProcess
 from daedalus.launch.process_lifecycle import FAILED, STOPPED, interrupts_held
 
 _logger = logging.getLogger(__name__)
@@ -75,6 +77,17 @@ def start(
         )
 
 
+Child = subprocess.Popen[bytes] | ForkedProcess
+
+
+class StartPlayer(Protocol):
+    """Function that starts a process which makes environments. See `start`."""
+
+    def __call__(self, module: str, *arguments: str, streams: Streams, one_thread: bool = False) -> Child:
+        """Start the process."""
+        ...
+
+
 class FailedError(Exception):
     """Error of a process that failed too often. `reason` says why, as far as it is known."""
 
@@ -93,7 +106,7 @@ class Supervised:
     """Process that is restarted when it dies before its work is done."""
 
     name: str
-    begin: Callable[[bool], subprocess.Popen[bytes]]  # starts the process; the argument is True for the first start
+    begin: Callable[[bool], Child]  # starts the process; the argument is True for the first start
     ended: Set[int]  # exit statuses that mean that the work is done
     # Exit statuses of a process that has not failed by itself, and how it ended.
     no_fault: Mapping[int, str] = field(default_factory=lambda: _LEARNERS_RESTARTS)
@@ -101,7 +114,7 @@ class Supervised:
     most_restarts: int = _MOST_RESTARTS
     restarts: int = 0
     failures: int = 0  # in a row, each soon after the start
-    process: subprocess.Popen[bytes] = field(init=False)
+    process: Child = field(init=False)
     _started: float = field(init=False)
     _ended_at: float | None = None
 
@@ -169,6 +182,7 @@ def supervised_actor(
     options: tuple[str, ...] = (),
     open_streams: OpenStreams = inherited,
     last_error: Callable[[str], str] = lambda _: "",
+    start: StartPlayer = start,
 ) -> Supervised:
     """Start an actor, or the evaluator, under supervision.
 
@@ -178,9 +192,10 @@ def supervised_actor(
       options: further options of `daedalus actor`.
       open_streams: where its output goes.
       last_error: returns the last line of standard error of a process by its name; it says why an actor failed.
+      start: starts the process.
     """
 
-    def begin(_first: bool) -> subprocess.Popen[bytes]:
+    def begin(_first: bool) -> Child:
         arguments = ["--connect", connect, "--name", name, *options]
         with open_streams(name) as streams:
             process = start("daedalus.cli.commands.actor", *arguments, streams=streams, one_thread=True)
@@ -197,7 +212,7 @@ def supervised_actor(
 
 @contextmanager
 def evaluators(
-    address: str, names: Sequence[str], options: tuple[str, ...], output: ChildOutput
+    address: str, names: Sequence[str], options: tuple[str, ...], output: ChildOutput, start: StartPlayer = start
 ) -> Iterator[Callable[[], str]]:
     """Start evaluators of this machine, and end them at the end.
 
@@ -206,6 +221,7 @@ def evaluators(
       names: of the evaluators. What the first one prints is shown.
       options: further options of `daedalus actor`.
       output: reads what they print.
+      start: starts each process.
 
     Yields a function that restarts those that died, and returns why one failed for good, or an empty string.
     """
@@ -229,7 +245,7 @@ def evaluators(
     try:
         for name in names:
             streams = output.pipes if name == names[0] else partial(output.pipes, shown=())
-            each = supervised_actor(name, address, (*options, "--evaluator"), streams, output.last_error)
+            each = supervised_actor(name, address, (*options, "--evaluator"), streams, output.last_error, start)
             # Until the end of the block, every end of a process is a failure. They play few episodes: if one is killed
             # again and again, there is a reason.
             each.ended, each.most_restarts = frozenset(), _MOST_FAILURES - 1
@@ -242,7 +258,7 @@ def evaluators(
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:
     """Start the gateway of a run under supervision, at an address of this machine, for whoever watches the run."""
 
-    def begin(_first: bool) -> subprocess.Popen[bytes]:
+    def begin(_first: bool) -> Child:
         arguments = ["--connect", connect, "--or-any-port", *options]
         with open_streams(GATEWAY) as streams:
             process = start("daedalus.cli.commands.gateway", *arguments, streams=streams, one_thread=True)
@@ -252,14 +268,14 @@ def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: Ope
     return Supervised(GATEWAY, begin, ended={0}, no_fault={})
 
 
-def _yield_to_learner(process: subprocess.Popen[bytes]) -> None:
+def _yield_to_learner(process: Child) -> None:
     """Let the learner run first."""
     with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
         niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
         os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
 
 
-def stop(processes: list[subprocess.Popen[bytes]], grace_seconds: float = _GRACE_SECONDS) -> None:
+def stop(processes: Sequence[Child], grace_seconds: float = _GRACE_SECONDS) -> None:
     """End processes: send SIGTERM to all, wait, then kill those that are left."""
     for process in processes:
         if process.poll() is None:

@@ -5,23 +5,35 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from daedalus.launch.callbacks import Callback, observed
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.environment_check import EnvironmentProblemError
+from daedalus.launch.environment_object import environment_object
 from daedalus.launch.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError
 from daedalus.launch.local_training import run_locally
 from daedalus.launch.logs import LineHandler, say
+from daedalus.launch.resumed_run import ResumeChoice, locked_to_resume, resumed_run, status_of
 from daedalus.launch.run_choice import NewRun, RunChoice, create_run
+from daedalus.launch.supervision import start
 from daedalus.learner.reporting.trackers.tracker import tracker_name
+from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.resuming import FinishedRun
+from daedalus.learner.run.run_lock import RunInUseError
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.user_modules import refuse_while_imported
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, refuse_while_imported
+from daedalus.transport.private_address import private_address
+
+if TYPE_CHECKING:
+    import gymnasium
+
+_logger = logging.getLogger(__name__)
 
 _KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
 
@@ -55,7 +67,7 @@ class RunResult:
 def train(
     preset: str | Path | None = None,
     *,
-    env: str | None = None,
+    env: "str | gymnasium.Env | Callable[..., gymnasium.Env] | None" = None,
     algorithm: str | None = None,
     actors: int | None = None,
     seed: int | None = None,
@@ -76,7 +88,10 @@ def train(
 
     Args:
       preset: a preset such as "cartpole", or the path of a TOML file such as a run's config.toml.
-      env: any gymnasium environment with default settings, instead of a preset; "module:Id" for your own.
+      env: any gymnasium environment with default settings, instead of a preset: its id, its class, a function that
+        returns one, or an instance. What no module has, such as a class of a notebook, a lambda or an instance, is
+        played by forks of this process, on Linux: each plays a copy of its own, and `resume` and `evaluate` need it
+        again. An instance is played by one actor.
       algorithm: "a2c", "a3c", "impala", "appo", "one_step_q", "one_step_sarsa" or "n_step_q", or "module:Class" for
         your own.
       actors: number of actor processes.
@@ -97,21 +112,19 @@ def train(
     """
     started = time.monotonic()
     refuse_while_imported("daedalus.train")
-    preset = str(preset) if isinstance(preset, Path) else preset
-    _check_types(preset, env, callback, settings)
-    log = (log,) if isinstance(log, str) else log
-    try:
-        log = [tracker_name(name) for name in log]
-    except ValueError as error:
-        raise SettingsError(f"log: {error}") from None
+    if not isinstance(preset, str | Path | None):
+        raise TypeError(f"preset must be a name or a path, not {preset}: an environment is passed as env")
+    _check_types(callback, settings)
+    given, trackers = environment_object(env), _trackers(log)
     choice = RunChoice(
-        preset=preset,
-        env=env,
+        preset=str(preset) if isinstance(preset, Path) else preset,
+        env=given.id,
         algorithm=algorithm,
         seed=seed,
         env_steps=env_steps,
         actors=actors,
         wrap=wrap,
+        is_instance=given.is_instance,
         settings=settings or {},
     )
     new = NewRun(
@@ -120,28 +133,111 @@ def train(
         init_from=None if init_from is None else Path(init_from),
         other_spaces=allow_other_spaces,
     )
-    with _checking(quiet):
-        lock, spec, spaces = create_run(new)
-    with lock, observed(callback, lock.directory) as (observer, control):
-        run = LocalRun(
-            directory=lock.directory,
-            spec=spec,
-            started=started,
-            lock=lock.inheritable,
-            spaces=spaces,
-            init_from=new.init_from,
-            log=tuple(log),
-            observer=observer,
+    with given.players() as start_player:
+        with _checking(quiet):
+            lock, spec, spaces = create_run(new)
+        with lock:
+            run = LocalRun(
+                directory=lock.directory,
+                spec=spec,
+                started=started,
+                lock=lock.inheritable,
+                spaces=spaces,
+                init_from=new.init_from,
+                log=trackers,
+                start_player=start_player,
+            )
+            return _trained(run, callback, quiet)
+
+
+def resume(
+    run_dir: str | Path,
+    *,
+    env: "gymnasium.Env | Callable[..., gymnasium.Env] | None" = None,
+    env_steps: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+    reset_statistics: bool = False,
+    allow_modules: Collection[str] = (),
+    callback: Callback | None = None,
+    log: str | Sequence[str] = (),
+    quiet: bool = False,
+) -> RunResult:
+    """Continue a run from its newest checkpoint, as `daedalus resume` does, and return the result.
+
+    Args:
+      run_dir: the directory of the run.
+      env: its environment, if that was an object which no module has. Its spaces must be those of the run.
+      env_steps: new budget, with the steps already done (default: the budget of the run).
+      settings: settings to change from now on. The environment, the network, the algorithm, the optimiser and the seed
+        cannot change.
+      reset_statistics: forget the running statistics of observations and rewards.
+      allow_modules: modules that config.toml names and that may be imported. Importing a module runs it, and a file
+        named it.
+      callback, log, quiet: see `train`. The trackers of the run go on in any case.
+
+    Returns the recorded result of a run that has nothing left to train. Raises as `train` does, SettingsError also for
+    a directory without a run, another environment and modules that are not allowed, and TrainingError also if another
+    process has the run.
+    """
+    started = time.monotonic()
+    refuse_while_imported("daedalus.resume")
+    _check_types(callback, settings)
+    directory, given = Path(run_dir), environment_object(env)
+    trackers = chosen_trackers(_trackers(log), directory)
+    recorded = run_directory.read_config(directory).environment
+    if not given.is_for(recorded.id):
+        raise SettingsError(
+            f"env is {given.id}, and the environment of the run in {directory} is {recorded.id}: leave env out, or "
+            f"start a new run from the weights of this one, with daedalus.train(env=..., init_from={str(directory)!r})"
         )
-        end = _run(run, quiet)
-    return _result(lock.directory, end, control.stop_reason)
+    choice = ResumeChoice(
+        directory=directory,
+        env_steps=env_steps,
+        settings=settings or {},
+        allowed_modules=frozenset({*allow_modules, *given.modules}),
+        reset_statistics=reset_statistics,
+    )
+    with given.players(recorded.id) as start_player:
+        try:
+            spec = choice.spec(from_python=given.maker is not None)
+            lock, init_from = locked_to_resume(directory)
+        except ModuleNotAllowedError as error:
+            remedy = f"if you trust that code, pass allow_modules={list(error.modules)}"
+            raise SettingsError(f"{error.reason}; {remedy}") from None
+        except UserModuleError as error:
+            raise SettingsError(str(error)) from None
+        except RunInUseError as error:
+            raise TrainingError(str(error)) from None
+        with lock, _checking(quiet):
+            run = resumed_run(choice, spec, lock, init_from, started=started)
+            if isinstance(run, FinishedRun):
+                _logger.info("nothing to do: %s", run.reason)
+                summary = run_directory.read_json(directory / run_directory.SUMMARY)
+                return _result(directory, RunEnd(status=status_of(run), summary=summary), None)
+        with lock:
+            return _trained(replace(run, log=trackers, start_player=start_player), callback, quiet)
 
 
-def _check_types(preset: object, env: object, callback: object, settings: object) -> None:
-    """Raise TypeError for objects that are often given in place of a name, or of an instance."""
-    for name in (preset, env):
-        if not isinstance(name, str | None):
-            raise TypeError(f'env must be the id of a registered environment, such as "CartPole-v1", not {name}')
+def _trained(run: LocalRun, callback: Callback | None, quiet: bool) -> RunResult:
+    """Run to the end, and return the result."""
+    with ExitStack() as stack:
+        if run.start_player is not start and run.spec.training.target_return is not None:
+            run = replace(run, player_address=stack.enter_context(private_address()))
+        observer, control = stack.enter_context(observed(callback, run.directory))
+        end = _run(replace(run, observer=observer), quiet)
+    return _result(run.directory, end, control.stop_reason)
+
+
+def _trackers(log: str | Sequence[str]) -> list[str]:
+    """Return the names of the trackers. Raises SettingsError."""
+    try:
+        return [tracker_name(name) for name in ((log,) if isinstance(log, str) else log)]
+    except ValueError as error:
+        raise SettingsError(f"log: {error}") from None
+
+
+def _check_types(callback: object, settings: object) -> None:
+    """Raise TypeError for objects that are often given in place of an instance, or of a map."""
     if not isinstance(callback, Callback | None):
         raise TypeError(f"callback must be an instance of a subclass of daedalus.Callback, not {callback}")
     if not isinstance(settings, Mapping | None) or not all(isinstance(path, str) for path in settings or ()):

@@ -100,6 +100,14 @@ class UserModules:
 NO_MODULES = UserModules()
 
 
+def object_of(module: ModuleType, name: str) -> Any:
+    """Return what has a qualified name such as `Class` or `Outer.Inner` in a module, or None."""
+    found: Any = module
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return found
+
+
 class UserState:
     """What of the interpreter's state code of the user has changed, kept apart from ours.
 

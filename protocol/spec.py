@@ -33,6 +33,9 @@ _Part = TypeVar("_Part", bound=Specification)
 _MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcome, and the names of the settings
 
 
+FROM_PYTHON = "python:"  # beginning of the id of an environment that only the program has which started the run
+
+
 def _check_environment_id(value: str) -> str:
     # It may come from a peer, and messages show it and suggest its module.
     module, colon, name = value.rpartition(":")
@@ -49,7 +52,8 @@ class EnvironmentSpec(Specification):
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_check_environment_id)]
-    """Environment to play: a gymnasium id, `module:Id` for your own, or the backend's own name."""
+    """Environment to play: a gymnasium id, `module:Id` or `module:Class` for your own, or the backend's own name.
+    `python:NAME` is an object that a Python program gave to `daedalus.train`, and that no module has."""
     backend: Backend = "gymnasium"
     """Implementation of the environment. `fast` is gymnasium's CarRacing-v3 with a cheaper renderer."""
     kwargs: dict[str, JsonValue] = Field(default_factory=dict)
@@ -101,8 +105,13 @@ class EnvironmentSpec(Specification):
     @property
     def user_modules(self) -> dict[str, str]:
         """Settings that name a module as `module:name`, with their values."""
-        named = {"environment.id": self.id, "environment.wrap": self.wrap}
+        named = {"environment.id": None if self.is_from_python else self.id, "environment.wrap": self.wrap}
         return {setting: value for setting, value in named.items() if value is not None and ":" in value}
+
+    @property
+    def is_from_python(self) -> bool:
+        """Whether only the Python program that started the run has the environment."""
+        return self.id.startswith(FROM_PYTHON)
 
     @property
     def trains_true_task(self) -> bool:

@@ -23,12 +23,12 @@ def change_certificates(directory: Path, words: str) -> None:
     assert certs([*words.split(), "--directory", str(directory)]) == 0
 
 
-def issue_expired(directory: Path, role: str, name: str = "") -> Path:
-    """Create a folder whose certificate expired yesterday, and return it."""
+def issue_expired(directory: Path, role: str, name: str = "", *, days: float = -1) -> Path:
+    """Create a folder whose certificate expired yesterday, or expires in some days, and return it."""
     folder = directory / f"expired-{role}"
     hosts = [] if name else ["localhost", "127.0.0.1"]
     authority = CertificateAuthority(directory / "ca" / f"{role}-{name}" if name else directory / "ca")
-    authority.issue(folder, common_name(role, name), hosts, -datetime.timedelta(days=1))
+    authority.issue(folder, common_name(role, name), hosts, datetime.timedelta(days=days))
     shutil.copyfile(directory / "ca" / "ca.pem", folder / "ca.pem")
     shutil.copyfile(directory / "router" / "clients.pem", folder / "clients.pem")
     return folder

@@ -176,14 +176,10 @@ def test_invalid_settings_are_refused(arguments: dict, message: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            {"env": gymnasium.make("CartPole-v1")},
-            'env must be the id of a registered environment, such as "CartPole-v1"',
-        ),
-        (
-            {"preset": gymnasium.make("CartPole-v1")},
-            'env must be the id of a registered environment, such as "CartPole-v1"',
-        ),
+        ({"env": 3}, 'env must be the id of a registered environment, such as "CartPole-v1", or a gymnasium.Env: its'),
+        ({"env": dict}, "env must be the id of a registered environment"),
+        ({"env": gymnasium.make_vec("CartPole-v1", 2)}, "env is CartPoleVectorEnv(CartPole-v1, num_envs=2), several"),
+        ({"preset": gymnasium.make("CartPole-v1")}, "preset must be a name or a path, not <TimeLimit<OrderEnforcing"),
         ({"preset": "cartpole", "callback": print}, "callback must be an instance of a subclass of daedalus.Callback"),
         (
             {"preset": "cartpole", "callback": daedalus.Callback},

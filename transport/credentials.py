@@ -15,7 +15,6 @@ import logging
 import os
 import ssl
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,13 +22,11 @@ from typing import Any
 
 from daedalus.transport.access_control import access_control
 from daedalus.transport.addresses import AddressError, check_connecting, check_listening
+from daedalus.transport.certificate_expiry import Validity, expiry_watch
 
 CA, CERTIFICATE, KEY, CLIENTS = "ca.pem", "certificate.pem", "key.pem", "clients.pem"
-WARNING_DAYS = 30  # before a certificate expires
 
-_NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which the module ssl does not name
-_DAY = 86_400.0
-
+NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which the module ssl does not name
 
 _logger = logging.getLogger(__name__)
 
@@ -74,29 +71,24 @@ class Credentials:
         names = _verified(self.directory, ignore_time=True).get("subjectAltName", ())
         return [str(value) for kind, value in names if kind in ("DNS", "IP Address")]
 
-    def days_left(self) -> float:
-        """Return the days until the certificate that is in the folder now expires; negative if it has expired.
-
-        Raises CredentialsError if the certificate is not readable.
-        """
-        return (_validity(self.directory)[1] - time.time()) / _DAY
-
-    def warn_of_expiry(self) -> None:
-        """Log a warning in the last 30 days of a certificate, or in the last third of a short-lived one.
+    def validity(self) -> Validity:
+        """Return from when to when the certificate that is in the folder now is valid.
 
         Raises CredentialsError if it is not readable.
         """
-        begins, ends = _validity(self.directory)
-        days = self.days_left()
-        if 0 <= days < min(WARNING_DAYS, (ends - begins) / _DAY / 3):
-            _logger.warning(
-                "the certificate in %s expires in %d days: renew it (daedalus certs renew)", self.directory, days
-            )
+        return _validity(self.directory)
 
-    def check_expiry(self) -> None:
-        """Raise CredentialsError if the certificate that is in the folder now has expired."""
-        if self.days_left() < 0:
-            raise NotValidNowError(f"{self.directory}: {_expired(self.directory)}")
+    def watch_expiry(self) -> None:
+        """Log a warning before the certificate expires and once it has expired, now and from now on."""
+        expiry_watch().add(self.directory, lambda: _readable_validity(self))
+
+    def check_valid_now(self) -> None:
+        """Raise NotValidNowError if the certificate that is in the folder now is not valid by the clock of this host.
+
+        Raises CredentialsError if it is not readable.
+        """
+        if fault := self.validity().fault():
+            raise NotValidNowError(f"{self.directory}: the certificate {fault}")
 
 
 def load(directory: Path, *roles: str) -> Credentials:
@@ -133,6 +125,11 @@ def common_name_of(certificate: dict[str, Any]) -> str:
     return str(subject.get("commonName", ""))
 
 
+def is_about_time(reason: str) -> bool:
+    """Return whether OpenSSL or an alert of the other end refuses a certificate by the clock."""
+    return "expired" in reason or "not yet valid" in reason
+
+
 def with_remedy(reason: str) -> str:
     """Return a reason given by OpenSSL, with what to do about it."""
     if "expired" in reason:
@@ -150,24 +147,29 @@ def _described(role: str, name: str) -> str:
     return f"{role} {name!r}" if name else role
 
 
-def _expired(directory: Path) -> str:
-    ended = time.gmtime(_validity(directory)[1])
-    return f"the certificate expired on {time.strftime('%Y-%m-%d', ended)}: renew it (daedalus certs renew)"
+def validity_of(certificate: dict[str, Any]) -> Validity:
+    """Return the validity of a certificate as the module ssl describes it."""
+    begins, ends = (ssl.cert_time_to_seconds(str(certificate[key])) for key in ("notBefore", "notAfter"))
+    return Validity(begins, ends)
 
 
-def _validity(directory: Path) -> tuple[float, float]:
-    """Return from when to when the certificate in a folder is valid, in seconds since 1970."""
+def _validity(directory: Path) -> Validity:
     try:
         return _read_validity(directory, (directory / CERTIFICATE).stat().st_mtime_ns)
     except OSError:
         raise CredentialsError(f"{directory} has no {CERTIFICATE}") from None
 
 
+def _readable_validity(credentials: Credentials | None) -> Validity | None:
+    """Return the validity of a certificate, or None without one, or while it is being replaced."""
+    with contextlib.suppress(CredentialsError):
+        return None if credentials is None else credentials.validity()
+    return None
+
+
 @functools.lru_cache(maxsize=16)
-def _read_validity(directory: Path, _modified: int) -> tuple[float, float]:
-    certificate = _verified(directory, ignore_time=True)
-    begins, ends = (ssl.cert_time_to_seconds(str(certificate[key])) for key in ("notBefore", "notAfter"))
-    return begins, ends
+def _read_validity(directory: Path, _modified: int) -> Validity:
+    return validity_of(_verified(directory, ignore_time=True))
 
 
 def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
@@ -187,7 +189,7 @@ def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
         raise CredentialsError(f"{directory}: {CERTIFICATE} or {KEY} is damaged: copy both again") from None
     server.verify_mode = ssl.CERT_REQUIRED
     if ignore_time:
-        server.verify_flags |= _NO_CHECK_TIME
+        server.verify_flags |= NO_CHECK_TIME
     client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname, client.verify_mode = False, ssl.CERT_NONE  # only the client's certificate is verified
     client.load_cert_chain(directory / CERTIFICATE, directory / KEY)
@@ -196,10 +198,11 @@ def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
         server.load_verify_locations(directory / CERTIFICATE)  # with the issuer of an actor or operator
         return _handshake(client, server)
     except ssl.SSLCertVerificationError as error:
-        if "expired" in error.verify_message and not ignore_time:
-            raise NotValidNowError(f"{directory}: {_expired(directory)}") from None
-        kind = NotValidNowError if "not yet valid" in error.verify_message else CredentialsError
-        raise kind(f"{directory}: {CERTIFICATE}: {with_remedy(error.verify_message)}") from None
+        if is_about_time(error.verify_message):
+            fault = _validity(directory).fault()  # else a certificate of its CA is meant
+            reason = f"the certificate {fault}" if fault else f"{CA}: {with_remedy(error.verify_message)}"
+            raise NotValidNowError(f"{directory}: {reason}") from None
+        raise CredentialsError(f"{directory}: {CERTIFICATE}: {with_remedy(error.verify_message)}") from None
     except ssl.SSLError:
         raise CredentialsError(f"{directory}: {CA} is damaged: copy it again") from None
 
@@ -306,6 +309,5 @@ def credentials_to_connect(endpoints: list[str], tls: str | Path | None, *roles:
 
 def certificate_days_left(credentials: Credentials | None) -> float | None:
     """Return the days until a certificate expires, or None without one, or while it is being replaced."""
-    with contextlib.suppress(CredentialsError):
-        return None if credentials is None else credentials.days_left()
-    return None
+    validity = _readable_validity(credentials)
+    return None if validity is None else validity.days_left()

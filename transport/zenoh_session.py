@@ -3,7 +3,6 @@
 A session either embeds a full router that listens (the learner, by default) or is a client of a router.
 """
 
-import contextlib
 import json
 import re
 import socket
@@ -14,7 +13,20 @@ from typing import Literal, NamedTuple
 import zenoh
 
 from daedalus.transport.addresses import socket_path
-from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, KEY, Credentials, CredentialsError, with_remedy
+from daedalus.transport.certificate_expiry import Validity
+from daedalus.transport.credentials import (
+    CA,
+    CERTIFICATE,
+    CLIENTS,
+    KEY,
+    NO_CHECK_TIME,
+    Credentials,
+    CredentialsError,
+    common_name_of,
+    is_about_time,
+    validity_of,
+    with_remedy,
+)
 from daedalus.transport.interface import AddressInUseError, RefusedError, TransportError
 from daedalus.transport.zenoh_settings import Capacity, session_settings
 
@@ -103,16 +115,18 @@ def _diagnose_socket(path: str) -> str:
 
 def _diagnose_refusal(link: socket.socket, host: str, endpoint: str, credentials: Credentials) -> Diagnosis:
     try:
-        context = ssl.create_default_context(cafile=str(credentials.directory / CA))
-        context.load_cert_chain(credentials.directory / CERTIFICATE, credentials.directory / KEY)
+        context = _client_context(credentials)
     except OSError:  # also ssl.SSLError
         return Diagnosis(f"the files in {credentials.directory} cannot be used any more: copy the folder again", False)
     try:
         with context.wrap_socket(link, server_hostname=host.strip("[]")) as secured:
             secured.recv(1)  # with TLS 1.3 a server refuses a certificate only after the client's handshake is done
     except ssl.SSLCertVerificationError as error:
-        reason = with_remedy(error.verify_message)
-        return Diagnosis(f"the certificate of the service at {endpoint} cannot be verified: {reason}", True)
+        peer = peer_certificate(endpoint, credentials) if is_about_time(error.verify_message) else None
+        service = "service" if peer is None else peer.common_name
+        fault = "" if peer is None else peer.validity.fault()
+        reason = f"it {fault}" if fault else with_remedy(error.verify_message)
+        return Diagnosis(f"the certificate of the {service} at {endpoint} cannot be verified: {reason}", True)
     except ssl.SSLError as error:
         if "alert" in str(error).lower():
             return Diagnosis(f"the service at {endpoint} refuses {_refused(error, credentials)}", True)
@@ -122,6 +136,39 @@ def _diagnose_refusal(link: socket.socket, host: str, endpoint: str, credentials
     return Diagnosis(f"the service at {endpoint} closed the connection", False)
 
 
+def _client_context(credentials: Credentials) -> ssl.SSLContext:
+    """Return the settings of a TLS connection with these credentials. Raises OSError."""
+    context = ssl.create_default_context(cafile=str(credentials.directory / CA))
+    context.load_cert_chain(credentials.directory / CERTIFICATE, credentials.directory / KEY)
+    return context
+
+
+class PeerCertificate(NamedTuple):
+    """What the certificate of a listener states."""
+
+    common_name: str
+    validity: Validity
+
+
+def peer_certificate(endpoint: str, credentials: Credentials) -> PeerCertificate | None:
+    """Return the certificate of the router or learner at an endpoint tls/HOST:PORT, also if it has expired.
+
+    None if nothing answers within some seconds, or if the certificate is not signed by the CA.
+    """
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    try:
+        context = _client_context(credentials)
+        context.verify_flags |= NO_CHECK_TIME
+        with (
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_PROBE_SECONDS) as link,
+            context.wrap_socket(link, server_hostname=host.strip("[]")) as secured,
+        ):
+            certificate = secured.getpeercert()
+    except (OSError, ValueError):  # also ssl.SSLError
+        return None
+    return PeerCertificate(common_name_of(certificate), validity_of(certificate)) if certificate else None
+
+
 def _refused(error: ssl.SSLError, credentials: Credentials) -> str:
     """Return what a service refuses, from its alert. The service itself was verified before."""
     reason = (error.reason or str(error)).lower().replace("_", " ")
@@ -129,6 +176,11 @@ def _refused(error: ssl.SSLError, credentials: Credentials) -> str:
     certificate = f"the certificate in {credentials.directory}"
     if reason in ("unknown ca", "decrypt error"):
         return f"{certificate}: it was revoked, or issued after the service's copy of {CLIENTS}"
+    if is_about_time(reason):  # this end has found the certificate valid
+        return (
+            f"{certificate} as expired or not yet valid, and by the clock of this host it is valid now "
+            f"({credentials.validity().period()}): the clock of one of the two hosts is wrong"
+        )
     return f"{certificate}: {with_remedy(reason)}"
 
 
@@ -153,8 +205,7 @@ def session_opener(
     """
     capacity = Capacity(message_bytes=max_message_bytes, descriptors=_descriptors())
     if credentials is not None:
-        with contextlib.suppress(CredentialsError):  # a file is being copied: opening the session says so
-            credentials.warn_of_expiry()
+        credentials.watch_expiry()
 
     def open_session() -> zenoh.Session:
         security = credentials.settings(listens=bool(listen_on)) if credentials else {}
@@ -196,7 +247,7 @@ def _opening_error(
     if connect_to:
         if credentials is not None:
             try:
-                credentials.check_expiry()
+                credentials.check_valid_now()
             except CredentialsError as error:
                 return RefusedError(str(error))
         diagnoses = [diagnose_connection(endpoint, credentials) for endpoint in connect_to]

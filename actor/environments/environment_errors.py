@@ -55,7 +55,8 @@ def not_registered(name: str, module: ModuleType) -> EnvironmentSetupError:
     few = f"it registers {', '.join(prefix + each for each in own[:_MOST_NAMES])}" if own else ""
     hint = _suggestion(name, own, prefix) or few + (" and others" if len(own) > _MOST_NAMES else "")
     return EnvironmentSetupError(
-        f"unknown environment {prefix + name!r}: {file_of(module)} registers no {name}{'; ' if hint else ''}{hint}"
+        f"unknown environment {prefix + name!r}: {file_of(module)} registers no {name}, and has no class or "
+        f"function of this name{'; ' if hint else ''}{hint}"
         f"{hidden_file(module)}"
     )
 

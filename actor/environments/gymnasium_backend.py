@@ -3,7 +3,7 @@
 import importlib
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -19,13 +19,14 @@ from daedalus.actor.environments.environment_errors import (
     unknown_to_gymnasium,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from daedalus.actor.environments.given_environment import Maker, given_environment
 from daedalus.actor.environments.gymnasium_environments import EnvironmentsInTurn, GymnasiumEnvironments
 from daedalus.actor.environments.info import has_choices
 from daedalus.actor.environments.rendering import CountedSteps, render_without_display
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_code import first_line
-from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules, object_of
+from daedalus.protocol.spec import FROM_PYTHON, EnvironmentSpec
 
 # Packages that register environments when they are imported: beginning of the id -> module and extra.
 _PACKAGES = {"ALE/": ("ale_py", "atari"), "MiniGrid-": ("minigrid", "minigrid"), "BabyAI-": ("minigrid", "minigrid")}
@@ -170,7 +171,12 @@ def _check_backend(spec: EnvironmentSpec, modules: UserModules) -> None:
 
 
 def registration(environment_id: str, modules: UserModules) -> EnvSpec:
-    """Return gymnasium's registration of `[module:]id`; importing the module registers it."""
+    """Return gymnasium's registration of `[module:]id`, which importing the module registers, or that of an object.
+
+    `module:Class` and `module:function` are such objects, and what a Python program has given to this process.
+    """
+    if environment_id.startswith(FROM_PYTHON):
+        return given_environment(environment_id)
     name, own = environment_id.rpartition(":")[2], None
     if name != environment_id:
         try:
@@ -187,6 +193,9 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
     try:
         return gymnasium.spec(name)
     except gymnasium.error.Error:
+        entry: Any = None if own is None else object_of(own, name)
+        if callable(entry):
+            return EnvSpec(id=name, entry_point=cast(Maker, entry))
         raise (unknown_to_gymnasium(name) if own is None else not_registered(name, own)) from None
 
 
@@ -225,6 +234,11 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
         if registered.entry_point is None:  # its environments share a random generator, so more than one would not do
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
+        if spec.is_from_python:
+            raise EnvironmentSetupError(
+                f"environment.processes is not for {spec.id}, which no module has: move it to a module, or start more "
+                "actors with one environment each (collection.envs_per_actor=1)"
+            )
         if ":" not in spec.id:  # no module registers it there: the program itself may have done it here
             factory = replace(factory, registered=registered)
         return _in_processes(factory, count)

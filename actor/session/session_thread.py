@@ -1,5 +1,6 @@
 """Drives a conversation on the caller's thread, which waits, and on the transport's threads, which bring events."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -26,6 +27,8 @@ from daedalus.actor.session.conversation import (
 from daedalus.transport.interface import Declaration, Inbox, QuerySender, RefusedError, Transport, TransportError
 from daedalus.transport.slow_calls import SlowCall
 
+_logger = logging.getLogger(__name__)
+
 _POLL_SECONDS = 0.2  # how soon a wait notices `stop`
 
 Result = TypeVar("Result")
@@ -45,6 +48,7 @@ class SessionThread:
         self._events = 0  # how many have come: one that comes between a step and its wait ends the wait at once
         self._seen_events = 0  # before the last step
         self._inboxes: dict[str, Inbox] = {}  # by key
+        self._logged = ""  # why no other session could be opened
         self._watched: set[str] = set()  # keys of presence
         self._declared: dict[str, Declaration] = {}  # likewise
 
@@ -165,8 +169,10 @@ class SessionThread:
             SlowCall(self._transport.reopen).wait(lambda: self.call(self._conversation.check_over))
         except RefusedError as error:  # it was revoked or has expired since the start
             raise ActorError(str(error)) from None
-        except TransportError:
-            pass  # no router now: the present session keeps trying
+        except TransportError as error:  # no router now: the present session keeps trying
+            if str(error) != self._logged:
+                _logger.info("%s; waiting for it", error)
+            self._logged = str(error)
 
     def _act(self, actions: list[AtOnce]) -> None:
         """Perform what is to be done at once. Without the lock."""

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from typing import NoReturn
 
 from daedalus.cli.arguments import (
     add_allow_module,
@@ -134,6 +135,11 @@ def main() -> int:
     return run_actor(actor_options(arguments), stop, context)
 
 
-if __name__ == "__main__":
+def run_process() -> NoReturn:
+    """Run the command of this process, and end it."""
     exit_on_thread_exceptions(plays=True)
     sys.exit(exit_status(main))
+
+
+if __name__ == "__main__":
+    run_process()

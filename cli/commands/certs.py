@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from daedalus.cli.arguments import command_parser
 from daedalus.launch.certificates import ClientTokens
 from daedalus.launch.logs import print_error, say
-from daedalus.transport.credentials import CLIENTS, WARNING_DAYS, CredentialsError
+from daedalus.transport.certificate_expiry import WARNING_DAYS
+from daedalus.transport.credentials import CLIENTS, CredentialsError
 
 if TYPE_CHECKING:
     from daedalus.launch.certificates import CertificateFolder, Identity

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
 from pathlib import Path
-from typing import Any, TextIO, get_args
+from typing import Any, NoReturn, TextIO, get_args
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episodes import EvaluationStoppedError
@@ -257,8 +257,13 @@ def _text(result: dict[str, Any]) -> str:
     return "\n".join([text, *result["notes"]])
 
 
-if __name__ == "__main__":
+def run_process() -> NoReturn:
+    """Run the command of this process, and end it."""
     exit_on_thread_exceptions(plays=True)
     open_standard_streams()  # before descriptors are opened
     stopped, result = stop_on_signals(exit_if_stuck=True), _reserved_stdout()
     sys.exit(exit_status(lambda: main(stop=stopped, output=result), result))
+
+
+if __name__ == "__main__":
+    run_process()

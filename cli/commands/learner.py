@@ -89,6 +89,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--no-progress", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--rows-to", type=int, help=argparse.SUPPRESS)
     options.add_argument("--spaces", type=Spaces.model_validate_json, help=argparse.SUPPRESS)
+    options.add_argument("--player-at", help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options
 
@@ -120,6 +121,7 @@ def learner_options(arguments: argparse.Namespace, started: float, here: Path) -
         shows_progress=not arguments.no_progress,
         started=arguments.started or started,
         spaces=arguments.spaces,
+        player_at=arguments.player_at,
         rows_to=arguments.rows_to,
         supervised=arguments.exit_with_parent,
     )

@@ -21,8 +21,9 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import one_line, policy_lag, printable, short_number
+from daedalus.transport.certificate_expiry import WARNING_DAYS
 from daedalus.transport.connecting import connect_once
-from daedalus.transport.credentials import SECURITY_ERRORS, WARNING_DAYS, Credentials, credentials_to_connect
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.status_query import ask, ask_events, no_answer, waiting_actors
 
@@ -361,7 +362,8 @@ def _refused(refused: RefusedJoin) -> str:
 def _expiry(days: float | None) -> list[str]:
     if days is None or days > WARNING_DAYS:
         return []
-    return [f"  the learner's certificate expires in {days:.0f} days: renew it (daedalus certs renew)"]
+    when = f"expires in {days:.0f} days" if days > 0 else f"expired {-days:.0f} days ago"
+    return [f"  the learner's certificate {when}: renew it (daedalus certs renew learner)"]
 
 
 def _missing_actors(status: RunStatus) -> list[str]:

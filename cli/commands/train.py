@@ -24,7 +24,7 @@ from daedalus.cli.arguments import (
 from daedalus.cli.screen import Screen, TrainingDisplay
 from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, new_run
 from daedalus.launch.child_output import ChildOutput, inherited
-from daedalus.launch.environment_check import EnvironmentProblemError, checked_spaces
+from daedalus.launch.environment_check import EnvironmentProblemError
 from daedalus.launch.local_run import (
     LocalRun,
     RunFailedError,
@@ -42,20 +42,15 @@ from daedalus.launch.process_lifecycle import (
     status_at_start,
     stop_on_signals,
 )
-from daedalus.launch.run_choice import create_run, with_record
+from daedalus.launch.resumed_run import ResumeChoice, locked_to_resume, resumed_run, status_of
+from daedalus.launch.run_choice import create_run
 from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.resuming import finished_run, initial_to_resume, with_changes
-from daedalus.learner.run.run_lock import RunInUseError, RunLock
+from daedalus.learner.run.resuming import FinishedRun
+from daedalus.learner.run.run_lock import RunInUseError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
-from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import (
-    ModuleNotAllowedError,
-    UserModuleError,
-    UserModules,
-)
-from daedalus.protocol.spec import RunSpec
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
 from daedalus.protocol.texts import exact_number, short_number
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
 
@@ -97,7 +92,6 @@ exit status: as of daedalus train"""
 # After a signal: for a call that uses the disk, and then for the end of the child processes, of which the learner takes
 # the longest
 _DISK_SECONDS, _END_SECONDS = 10.0, 90.0
-_MISSED = 3  # exit status: the budget was used up before the target
 
 
 def train(arguments: list[str]) -> int:
@@ -141,9 +135,15 @@ def resume(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         _check_watching(parsed)
-        spec = _resumed_spec(parsed)
-        init_from = initial_to_resume(parsed.directory)
-        lock = RunLock(parsed.directory)
+        choice = ResumeChoice(
+            directory=parsed.directory,
+            env_steps=parsed.env_steps,
+            assignments=parsed.set,
+            allowed_modules=frozenset(parsed.allow_module),
+            reset_statistics=parsed.reset_statistics,
+        )
+        spec = choice.spec()
+        lock, init_from = locked_to_resume(parsed.directory)
     except ModuleNotAllowedError as error:
         print_error("resume", allowing(error, ["daedalus", "resume", *arguments]))
         return 2
@@ -154,41 +154,16 @@ def resume(arguments: list[str]) -> int:
         print_error("resume", error)
         return status_at_start(error)
     with lock:
-        finished = finished_run(parsed.directory, spec)
-        if finished is not None and not finished.to_evaluate:
-            say(f"nothing to do: {finished.reason}")
-            return _MISSED if finished.missed else 0
         try:
-            begun = checkpoints(parsed.directory) and not spec.environment.user_modules  # whose folder may be another
-            spaces = None if begun else checked_spaces(spec, fork=True)
-            run_directory.write_config(parsed.directory, spec)
+            run = resumed_run(choice, spec, lock, init_from, started=started, fork=True)
         except (EnvironmentProblemError, SettingsError) as error:
             print_error("resume", error)
             return 1
-        run = LocalRun(
-            directory=lock.directory,
-            spec=spec,
-            started=started,
-            lock=lock.inheritable,
-            spaces=spaces,
-            init_from=init_from,
-            resume=True,
-            reset_statistics=parsed.reset_statistics,
-            trained=None if finished is None else _MISSED if finished.missed else 0,
-            **_machine_options(parsed, lock.directory),
-        )
+        if isinstance(run, FinishedRun):
+            say(f"nothing to do: {run.reason}")
+            return status_of(run)
+        run = replace(run, **_machine_options(parsed, lock.directory))
         return _run(run, screen, exits_with_parent=parsed.exit_with_parent)
-
-
-def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
-    """Return the specification of a run with the changes of the command line. Raises SettingsError, UserModuleError."""
-    spec = run_directory.read_config(parsed.directory)
-    source = str(parsed.directory / run_directory.CONFIG)
-    modules = UserModules(frozenset(parsed.allow_module), source)
-    modules.check(spec.user_modules)
-    budget = [] if parsed.env_steps is None else [f"training.env_steps={parsed.env_steps}"]
-    with Surroundings():  # which an algorithm of the user may change when it is imported
-        return with_record(with_changes(spec, [*parsed.set, *budget], parsed.directory), modules)
 
 
 def train_parser() -> argparse.ArgumentParser:

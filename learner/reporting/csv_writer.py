@@ -4,6 +4,7 @@ import csv
 import errno
 import io
 import logging
+import math
 import os
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -105,8 +106,10 @@ def cut_rows(path: Path, env_steps: int) -> list[dict[str, float]]:
     _remove_partial_line(path)
     columns = list(_header(path))
     found = array("d")  # env_steps and wall_seconds
+    places = [columns.index(name) if name in columns else -1 for name in ("env_steps", "wall_seconds")]
     for cells in islice(_rows(path), 1, None):
-        found.extend(_values(("env_steps", "wall_seconds"), columns, cells))
+        values = [*_values(columns, cells), math.nan]
+        found.extend([values[place] for place in places])
     steps, seconds = np.frombuffer(found).reshape(-1, 2).T
     kept, undone = lasting(steps, seconds), steps > env_steps
     removed = compress(islice(_rows(path), 1, None), kept & undone)
@@ -124,19 +127,23 @@ def thin_file(path: Path) -> None:
     if before <= thinning.MAX_BYTES:
         return
     columns = list(_header(path))
-    rows = ((line_bytes(cells), _values(columns, columns, cells)) for cells in islice(_rows(path), 1, None))
+    rows = ((line_bytes(cells), _values(columns, cells)) for cells in islice(_rows(path), 1, None))
     values = bounded(columns, rows).tolist()
-    _rewrite(path, columns, ([exact_number(None if cell != cell else cell) for cell in row] for row in values))
+    _rewrite(path, columns, ([exact_number(cell if math.isfinite(cell) else None) for cell in row] for row in values))
     _logger.info(
         "%s had %.0f MiB and has %.1f MiB: old rows are merged, the newest are as they were",
         *(path.name, before / 2**20, path.stat().st_size / 2**20),
     )
 
 
-def _values(names: Sequence[str], columns: list[str], cells: Sequence[str]) -> list[float]:
-    """Return the values of some columns of a line; NaN: no value."""
-    row = numbers(columns, list(cells))
-    return [row.get(name, np.nan) for name in names]
+def _values(columns: list[str], cells: Sequence[str]) -> list[float]:
+    """Return the values of a line, one for each column; NaN: no value."""
+    with suppress(ValueError):
+        values = [float(cell) if cell else math.nan for cell in cells]
+        if len(values) == len(columns):
+            return values
+    row = numbers(columns, list(cells))  # a damaged line
+    return [row.get(name, math.nan) for name in columns]
 
 
 def _rewrite(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

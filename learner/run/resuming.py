@@ -5,14 +5,14 @@ Without torch, so that a command can import it early.
 
 import logging
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.run.counters import RunCounters, check_counters
 from daedalus.learner.run.run_directory import SUMMARY, VERSIONS, read_json
-from daedalus.learner.run.settings import SettingsError, override, run_spec
+from daedalus.learner.run.settings import SettingsError, assign, override, run_spec
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
 from daedalus.policy.user_modules import NO_MODULES, UserModules
@@ -33,14 +33,19 @@ _FIXED = {"training.algorithm", "training.optimizer", "training.seed", "training
 _CHANGEABLE = {"environment.max_episode_steps", "environment.processes"}
 
 
-def with_changes(spec: RunSpec, assignments: Sequence[str], directory: Path) -> RunSpec:
-    """Return the specification of a run with `section.key=value` assignments applied.
+def with_changes(
+    spec: RunSpec, assignments: Sequence[str], directory: Path, values: Mapping[str, Any] | None = None
+) -> RunSpec:
+    """Return the specification of a run with `section.key=value` assignments, and values by `section.key`, applied.
 
     Raises SettingsError for an invalid assignment, and for settings that cannot change when the run in `directory` is
     resumed.
     """
     settings = spec.model_dump(mode="json", exclude_none=True)
     override(settings, assignments)
+    for path, value in (values or {}).items():
+        assign(settings, path, value)
+    assignments = [*assignments, *(f"{path}={value}" for path, value in (values or {}).items())]
     try:
         changed = run_spec(settings)
         fixed = fixed_changes(spec, changed)

@@ -103,7 +103,8 @@ def test_environment_that_its_module_does_not_register_is_reported_with_the_file
     with pytest.raises(EnvironmentSetupError) as error:
         make_environments(EnvironmentSpec(id=name), 1, modules=UserModules(frozenset({module})))
     assert re.fullmatch(
-        rf"unknown environment '{name}': \S*{module}.py registers no {asked}{re.escape(hint)}", str(error.value)
+        rf"unknown environment '{name}': \S*{module}.py registers no {asked}, and .*{re.escape(hint)}",
+        str(error.value),
     )
 
 

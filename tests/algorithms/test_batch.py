@@ -142,10 +142,11 @@ class Numbered:
     factors: Tensor  # [T, B]
 
     def pass_of(self, count: int) -> list[Minibatch]:
-        return list(minibatches(self.batch, self.numbers, self.targets, self.factors, count))
+        return list(minibatches(self.batch, self.numbers, 10.0 * self.numbers, self.targets, self.factors, count))
 
     def assert_holds(self, minibatch: Minibatch) -> None:
         """Assert that every row of a minibatch equals the row of the batch with the same number."""
+        assert torch.equal(minibatch.values, 10.0 * minibatch.log_probs)
         for row, column in torch.cartesian_prod(*map(torch.arange, minibatch.log_probs.shape)).tolist():
             t, b = divmod(int(minibatch.log_probs[row, column]), WIDTH)
             assert torch.equal(minibatch.observations[NAME][row, column], self.batch.observations[NAME][t, b])
@@ -215,7 +216,7 @@ def test_an_action_may_have_the_name_of_a_large_observation() -> None:
     made = numbered(state_size=0)
     image = torch.randn(ROWS + 1, WIDTH, 40, 40)  # too large to be gathered for a whole pass
     batch = replace(made.batch, observations={ACTION: image})
-    for minibatch in minibatches(batch, made.numbers, made.targets, made.factors, 4):
+    for minibatch in minibatches(batch, made.numbers, made.numbers, made.targets, made.factors, 4):
         for column, number in enumerate(minibatch.log_probs[0].int().tolist()):
             t, b = divmod(number, WIDTH)
             assert torch.equal(minibatch.observations[ACTION][0, column], image[t, b])

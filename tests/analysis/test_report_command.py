@@ -102,6 +102,29 @@ def test_a_report_shows_evaluation_curves_settings_and_versions(folder: Path) ->
     assert "daedalus train run/config.toml" in text
 
 
+def test_settings_that_are_the_defaults_are_collapsed(folder: Path) -> None:
+    run = record(folder / "run", settings=["collection.window=7"])
+    assert report(["run"]) == 0
+    chosen, others = (run / "report.html").read_text().split("settings with their default values")
+    shown, hidden = (
+        re.findall(r'<th scope="row">(\w+)</th>', part) for part in (chosen, others.split("</details>")[0])
+    )
+    assert {"id", "window", "target_return", "learning_rate"} <= set(shown)
+    assert {"discount_factor", "action_repeat"} <= set(hidden)
+    assert not {"discount_factor", "action_repeat"} & set(shown)
+    assert not {"id", "window"} & set(hidden)
+
+
+def test_commands_allow_the_modules_of_a_run(folder: Path) -> None:
+    settings = ["environment.id=corridor:Corridor-v0", "policy.encoder=layers:Net"]
+    run = record(folder / "run", settings=settings, evaluation=None, finished=False)
+    assert report(["run"]) == 0
+    text = Page(run / "report.html").text
+    assert "daedalus train run/config.toml\ndaedalus evaluate run --allow-module corridor made" in text
+    assert "daedalus evaluate run --allow-module corridor --record" in text
+    assert "continue it with: daedalus resume run --allow-module corridor --allow-module layers" in text
+
+
 def test_a_histogram_counts_the_episodes(folder: Path) -> None:
     run = evaluated(record(folder / "run"), [0.0, 0.0, 0.0, 10.0])
     assert report(["run"]) == 0

@@ -35,6 +35,7 @@ def reports(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> list[Path
     poor = record(folder / "poor", evaluation=None, finished=False)
     (poor / "replay.gif").write_bytes(GIF)
     record(folder / "other", settings=["collection.rollout_length=7"], returns=[None, None, 1.0])
+    record(folder / "acrobot", preset="acrobot")
     assert report([str(rich)]) == report([str(poor)]) == 0
     assert report([str(folder), "--output", str(folder / "report.html")]) == 0
     return [rich / "report.html", poor / "report.html", folder / "report.html"]

@@ -107,15 +107,15 @@ def test_renew_replaces_certificates_that_expire_soon(tmp_path: Path, capsys: py
     assert certs(["issue", "router", "--host", "far", "--days", "20", "--directory", str(made)]) == 0
     clients = (made / "learner" / "clients.pem").read_bytes()
     assert certs(renew) == 0
-    days = {folder: load(made / folder, role).days_left() for folder, role in ROLES.items()}
+    days = {folder: load(made / folder, role).validity().days_left() for folder, role in ROLES.items()}
     assert all(days[folder] > 800 for folder in ROLES)
     assert "valid for far, " in capsys.readouterr().out  # the hosts stay
     assert (made / "learner" / "clients.pem").read_bytes() == clients  # nothing to copy to the listeners
     assert certs([*renew, "actor", "arm", "--days", "7"]) == 0
-    assert load(made / "actor-arm", "actor").days_left() < 8
-    assert load(made / "actor-box", "actor").days_left() > 800
+    assert load(made / "actor-arm", "actor").validity().days_left() < 8
+    assert load(made / "actor-box", "actor").validity().days_left() > 800
     assert certs([*renew, "actor", "--days", "6"]) == 0
-    assert load(made / "actor-box", "actor").days_left() < 7
+    assert load(made / "actor-box", "actor").validity().days_left() < 7
 
 
 def test_renew_replaces_tokens_that_expire_soon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """Test of launch/prometheus_exporter.py."""
 
+import time
 from collections.abc import Iterable
 
 import pytest
@@ -8,7 +9,7 @@ from prometheus_client.core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from statuses import actor_status, run_status
 
-from daedalus.launch.prometheus_exporter import metrics
+from daedalus.launch.prometheus_exporter import CertificateDays, metrics
 from daedalus.protocol.messages import RunStatus
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
@@ -57,11 +58,25 @@ def test_the_values_of_a_run_and_its_actors_are_exported() -> None:
 
 
 def test_an_unknown_value_has_no_sample() -> None:
-    samples = scraped(run_status(episode_return_mean=None, checkpoint_age_seconds=None, certificate_days_left=None))
+    samples = scraped(run_status(episode_return_mean=None, checkpoint_age_seconds=None))
     assert value(samples, "daedalus_episode_return_mean", run="mine") is None
     assert value(samples, "daedalus_checkpoint_age_seconds", run="mine") is None
-    assert value(samples, "daedalus_certificate_days_left", run="mine") is None
-    assert value(scraped(run_status(certificate_days_left=7.5)), "daedalus_certificate_days_left", run="mine") == 7.5
+
+
+def test_the_certificate_of_a_learner_is_exported_after_the_learner_has_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A learner ends when its certificate expires: the gauge then goes below 0, and disappears a week later."""
+    days, now = CertificateDays([], None), time.time()
+
+    def seen(days_later: float, *statuses: RunStatus) -> dict[str, float]:
+        monkeypatch.setattr(time, "time", lambda: now + days_later * 86_400)
+        return {sample.labels["run"]: round(sample.value, 3) for sample in days.metric(statuses).samples}
+
+    assert seen(0.0, run_status(certificate_days_left=None)) == {}
+    assert seen(0.0, run_status(certificate_days_left=1.5)) == {"mine": 1.5}
+    assert seen(1.0) == {"mine": 0.5}
+    assert seen(5.0) == {"mine": -3.5}
+    assert seen(7.1) == {}
+    assert seen(7.2, run_status(certificate_days_left=365.0)) == {"mine": 365.0}
 
 
 def test_a_run_with_a_problem_is_not_healthy() -> None:

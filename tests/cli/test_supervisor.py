@@ -15,7 +15,7 @@ from daedalus.launch import supervision
 from daedalus.launch.local_run import LocalRun, RunObserver
 from daedalus.launch.local_training import watch
 from daedalus.launch.process_lifecycle import STOPPED, UNSAVED
-from daedalus.launch.supervision import FailedError, Supervised, stop, supervised_actor
+from daedalus.launch.supervision import Child, FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 
@@ -199,7 +199,7 @@ def test_training_that_a_callback_ended_is_not_evaluated_if_its_last_checkpoint_
     tmp_path: Path,
 ) -> None:
     class Ending(RunObserver):
-        def poll(self, learner: subprocess.Popen[bytes]) -> bool:
+        def poll(self, learner: Child) -> bool:
             return (tmp_path / "ready").exists()
 
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))

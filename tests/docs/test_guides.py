@@ -5,9 +5,11 @@ import json
 import sys
 import threading
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+import torch
 from allowed_modules import TEST_MODULES
 from building import SPACES, make_rollouts
 from pages import DOCS, ROOT, code_blocks
@@ -16,6 +18,7 @@ from recorded_runs import record
 
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.make import make_environments
+from daedalus.algorithms.losses import shares_of
 from daedalus.launch.callbacks import TrainingRun
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.run_choice import with_record
@@ -43,7 +46,7 @@ def example(guide: str, language: str = "python", number: int = 0) -> str:
 
 def test_the_environment_can_be_played(folder: Path) -> None:
     (folder / "corridor.py").write_text(example("environment.md"))
-    (folder / "corridor_wrappers.py").write_text(example("environment.md", number=1))
+    (folder / "corridor_wrappers.py").write_text(example("environment.md", number=2))
     spec = EnvironmentSpec(id="corridor:Corridor-v0", kwargs={"cells": 8}, wrap="corridor_wrappers:step_costs")
     environments = PlainEnvironments(make_environments(spec, 2, modules=TEST_MODULES))
     assert choices(environments.spaces) == 2
@@ -108,8 +111,44 @@ def test_the_algorithm_learns(folder: Path) -> None:
     assert not np.array_equal(learner.weights()["policy_head.weight"], before["policy_head.weight"])
 
 
+def test_the_value_loss_of_the_clipped_algorithm_is_that_of_the_paper(folder: Path) -> None:
+    """Engstrom et al. (2020), section 3, row by row. Where the clipped error is the worse one, there is no gradient."""
+    (folder / "my_ppo.py").write_text(example("algorithm.md", number=1))
+    modules = UserModules(frozenset({"my_ppo"}))
+    training = {"algorithm": "my_ppo:ValueClipped", "algorithm_kwargs": {"value_clip": 0.5}, "passes": 2}
+    spec = with_record(run_spec({"environment": {"id": "Any-v0"}, "training": training}), modules).training
+    learner = Learner(spec, PolicySpec(hidden=(8,)), SPACES, modules)
+    before = {name: values.copy() for name, values in learner.weights().items()}
+    assert learner.step(make_rollouts(1), 0.0) == []
+    assert learner.metrics.take_means()["value_loss"] > 0.0
+    assert not np.array_equal(learner.weights()["value_head.weight"], before["value_head.weight"])
+
+    class Rows(NamedTuple):
+        values: torch.Tensor
+        targets: torch.Tensor
+        shares: torch.Tensor
+
+    generator = torch.Generator().manual_seed(1)
+    old, new, targets = (torch.randn(1, 200, generator=generator) for _ in range(3))
+    new.requires_grad_()
+    counted = torch.arange(200) % 3 != 0
+    algorithm = importlib.import_module("my_ppo").ValueClipped(spec, None, 0.5)
+    loss = algorithm.value_loss(Rows(old, targets, shares_of(counted.float().unsqueeze(0))), new)
+    loss.backward()
+    errors, moving = [], []
+    for v, v_old, g in zip(new[0].tolist(), old[0].tolist(), targets[0].tolist(), strict=True):
+        clipped = min(max(v, v_old - 0.5), v_old + 0.5)
+        errors.append(max((v - g) ** 2, (clipped - g) ** 2))
+        moving.append((v - g) ** 2 >= (clipped - g) ** 2)
+    expected = [error for error, counts in zip(errors, counted.tolist(), strict=True) if counts]
+    assert loss.item() == pytest.approx(sum(expected) / len(expected), rel=1e-5)
+    assert new.grad is not None
+    assert ((new.grad[0] != 0.0) == (torch.tensor(moving) & counted)).all()
+    assert 20 < (torch.tensor(moving) & counted).sum() < counted.sum() - 20  # both errors were the worse one
+
+
 def test_the_algorithm_of_action_values_learns(folder: Path) -> None:
-    (folder / "my_values.py").write_text(example("algorithm.md", number=1))
+    (folder / "my_values.py").write_text(example("algorithm.md", number=2))
     modules = UserModules(frozenset({"my_values"}))
     spec = run_spec({"environment": {"id": "Any-v0"}, "training": {"algorithm": "my_values:DoubleQ"}})
     spec = with_record(spec, modules)

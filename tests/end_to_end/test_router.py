@@ -2,6 +2,7 @@
 
 import urllib.request
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from processes import Running, free_address, until
 from prometheus_client.parser import text_string_to_metric_families
 
 from daedalus.cli.command_table import COMMANDS
+from daedalus.launch.certificates import CertificateFolder, Identity
 
 Start = Callable[..., Running]
 
@@ -51,14 +53,24 @@ def test_a_learner_that_waits_for_a_router_is_alive_and_leaves_no_directory(
     assert not (tmp_path / "run").exists()
 
 
-def test_router_and_exporter_accept_only_certificates_of_their_ca(start: Start, address: str, tmp_path: Path) -> None:
+def test_router_and_exporter_accept_only_certificates_of_their_ca_and_say_when_they_expire(
+    start: Start, address: str, tmp_path: Path
+) -> None:
     certificates = make_certificates(tmp_path / "certs")
+    CertificateFolder(certificates).issue([Identity("router")], timedelta(minutes=20))
     tls = address.replace("tcp/", "tls/")
-    start("router", "--listen", tls, "--tls", certificates / "router").expect(
-        f"listening on {tls}; the certificate is for .*localhost, 127.0.0.1"
-    )
+    router = start("router", "--listen", tls, "--tls", certificates / "router")
+    router.expect("the certificate in .*router expires in 19 minutes, on .*: renew it")
+    router.expect(f"listening on {tls}; the certificate is for .*localhost, 127.0.0.1")
     asked = ("exporter", "--connect", tls, "--listen", "127.0.0.1:0", "--tls")
-    start(*asked, certificates / "operator").expect("http://")
+    where = start(*asked, certificates / "operator").expect(r"http://\S+")[0]
+
+    def days_left() -> dict[str, float]:
+        families = text_string_to_metric_families(urllib.request.urlopen(where).read().decode())
+        samples = [sample for family in families for sample in family.samples]
+        return {each.labels["role"]: each.value for each in samples if each.name == "daedalus_certificate_days_left"}
+
+    until(lambda: 0.0 < days_left().get("router", 0.0) < 20 / 1440 and days_left()["exporter"] > 800)
     strange = start(*asked, make_certificates(tmp_path / "strange") / "operator")
     strange.expect("cannot be verified: .*different CAs")
     assert strange.process.poll() is None  # somebody else can correct it: the exporter tries again

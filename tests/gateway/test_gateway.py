@@ -2,7 +2,10 @@
 
 import asyncio
 import json
+import socket
+import statistics
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -46,6 +49,32 @@ def ended(client: JsonClient) -> int:
         client.receive()
     assert closed.value.rcvd is not None
     return closed.value.rcvd.code
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_QUICKACK"), reason="Linux")
+def test_a_reward_before_an_act_is_acknowledged_at_once(learner: ScriptedLearner, connect: Connect) -> None:
+    """A client without TCP_NODELAY sends the act when the reward is acknowledged: 40 ms later, by default."""
+    client = connect()
+    client.hello("arm-1")
+    client.socket.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0)
+
+    def median_seconds(step: Callable[[], object]) -> float:
+        seconds = []
+        for _ in range(60):  # the system acknowledges the first ones at once
+            began = time.monotonic()
+            step()
+            seconds.append(time.monotonic() - began)
+        return statistics.median(seconds)
+
+    def in_two_messages() -> None:
+        client.send("reward", reward=1.0)
+        client.act([0.0] * 4)
+
+    client.act([0.0] * 4)
+    in_one = median_seconds(lambda: client.act([0.0] * 4, reward=1.0))
+    in_two = median_seconds(in_two_messages)
+    print(f"a step: {1e3 * in_one:.2f} ms in one message, {1e3 * in_two:.2f} ms in two")
+    assert in_two < 3.0 * in_one + 0.02
 
 
 def test_rollouts_of_a_client_reach_the_learner_under_its_name(learner: ScriptedLearner, connect: Connect) -> None:

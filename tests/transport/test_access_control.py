@@ -1,5 +1,6 @@
 """Permissions of each role over real TLS on a real router, and rejected certificates."""
 
+import datetime
 import os
 import shutil
 import time
@@ -14,7 +15,7 @@ from routers import listen_somewhere
 from daedalus.cli.commands.router import router
 from daedalus.learner.serving.actor_server import LOOK
 from daedalus.protocol import keys
-from daedalus.transport.credentials import CredentialsError, load, with_remedy
+from daedalus.transport.credentials import CredentialsError, NotValidNowError, load, with_remedy
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.zenoh_transport import connect, listen
 
@@ -269,7 +270,8 @@ def test_foreign_certificate_with_our_ca_file_is_rejected(address: str, certific
 
 def test_expired_certificate_is_rejected_when_loaded(certificates: Path) -> None:
     with pytest.raises(
-        CredentialsError, match=r"the certificate expired on \d{4}-\d\d-\d\d: renew it \(daedalus certs renew\)"
+        CredentialsError,
+        match=r"the certificate expired on \d{4}-\d\d-\d\d \d\d:\d\d UTC, and the clock of this host says .*: renew it",
     ):
         load(issue_expired(certificates, "actor", "arm"), "actor")
 
@@ -281,8 +283,31 @@ def test_expired_certificate_is_refused_with_a_reason(address: str, certificates
 
 def test_listener_with_an_expired_certificate_is_not_trusted(certificates: Path) -> None:
     address, router = listen_somewhere(issue_expired(certificates, "router"))
-    with closing(router), pytest.raises(RefusedError, match=r"cannot be verified: .*expired"):
+    with closing(router), pytest.raises(RefusedError) as raised:
         connect([address], load(certificates / "actor-arm", "actor"))
+    assert f"the certificate of the router at {address} cannot be verified: it expired on" in str(raised.value)
+
+
+def test_a_clock_that_is_wrong_is_named_at_both_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a clock that is behind, certificates are not valid yet; the other end has no clock that it could compare."""
+    certificates = make_certificates(tmp_path / "certs")
+    address, router = listen_somewhere(certificates / "router")
+    with monkeypatch.context() as patch:
+        patch.setattr("daedalus.launch.certificates._CLOCK_SKEW", datetime.timedelta(days=-1))
+        actor, listener = (issue_expired(certificates, *who, days=9) for who in (("actor", "arm"), ("router",)))
+    not_yet = rf"is not valid before 20.* the clock of this host says {time.strftime('%Y-%m-%d', time.gmtime())}"
+    with pytest.raises(NotValidNowError, match=not_yet):
+        load(actor, "actor")
+    where, early = listen_somewhere(listener)
+    with (
+        closing(early),
+        pytest.raises(RefusedError, match=f"the certificate of the router at {where} .*: it {not_yet}"),
+    ):
+        connect([where], load(certificates / "actor-box", "actor"))
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 2 * 86_400)  # the clock of the actor, and of nobody else
+    with closing(router), pytest.raises(RefusedError, match=r"as expired or not yet valid, and by the clock of this"):
+        connect([address], unchecked(actor))
 
 
 def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path) -> None:

@@ -16,10 +16,10 @@ from routers import listen_somewhere
 
 from daedalus.launch.certificates import CertificateFolder, Identity
 from daedalus.protocol import keys
-from daedalus.transport import credentials
-from daedalus.transport.credentials import Credentials, CredentialsError, load
+from daedalus.transport import certificate_expiry, credentials
+from daedalus.transport.certificate_expiry import ExpiryWatch, Validity
+from daedalus.transport.credentials import CredentialsError, load
 from daedalus.transport.interface import RefusedError, Request, Transport, TransportError
-from daedalus.transport.zenoh_session import session_opener
 from daedalus.transport.zenoh_transport import connect
 
 DAYS = datetime.timedelta(days=365)
@@ -154,18 +154,24 @@ def test_a_warning_30_days_before_a_certificate_expires(
     """A short-lived certificate warns only in its last third."""
     folder.issue([ARM], DAYS)
     folder.issue([LATE], datetime.timedelta(days=29))
-    arm, late = (load(folder.directory / identity.folder, "actor") for identity in (ARM, LATE))
+    arm, late = (load(folder.directory / identity.folder, "actor").validity() for identity in (ARM, LATE))
 
-    def warned(certificate: Credentials, days_later: float) -> bool:
-        LINES.clear()
+    def warning(validity: Validity, days_later: float) -> str:
         with monkeypatch.context() as patch:
             now = time.time()
             patch.setattr(time, "time", lambda: now + days_later * 86_400)
-            session_opener("client", [], [], certificate, 1)
-        return any("renew it (daedalus certs renew)" in line for line in LINES)
+            return validity.warning()[:10]
 
-    assert [warned(arm, days) for days in (0, 334, 336, 366)] == [False, False, True, False]
-    assert [warned(late, days) for days in (0, 19, 20)] == [False, False, True]
+    assert [warning(arm, days) for days in (0, 334, 336, 366)] == ["", "", "expires in", "expired on"]
+    assert [warning(late, days) for days in (0, 19, 20)] == ["", "", "expires in"]
+
+
+def test_the_warning_is_repeated_and_expiry_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(certificate_expiry, "_MIN_PAUSE_SECONDS", 0.0)
+    now = time.time()
+    ExpiryWatch().add(Path("certs/router"), lambda: Validity(now - 7.0, now + 3.0))
+    until(lambda: any("certs/router expired on" in line for line in LINES))
+    assert sum("certs/router expires in" in line for line in LINES) >= 2
 
 
 def test_client_whose_certificate_expires_in_use_is_told_so(address: str, folder: CertificateFolder) -> None:
@@ -177,10 +183,10 @@ def test_client_whose_certificate_expires_in_use_is_told_so(address: str, folder
 
 def test_expiry_of_the_certificate_in_the_folder_is_checked(folder: CertificateFolder) -> None:
     arm = load(folder.directory / ARM.folder, "actor")
-    arm.check_expiry()
+    arm.check_valid_now()
     folder.issue([ARM], -datetime.timedelta(days=1))
-    assert -1.1 < arm.days_left() < -0.9
+    assert -1.1 < arm.validity().days_left() < -0.9
     with pytest.raises(CredentialsError, match=r"actor-arm: the certificate expired on \d{4}-\d\d-\d\d"):
-        arm.check_expiry()
+        arm.check_valid_now()
     folder.issue([ARM], DAYS)
-    arm.check_expiry()
+    arm.check_valid_now()
