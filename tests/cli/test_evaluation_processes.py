@@ -4,13 +4,11 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 from log_lines import LINES
 from saved_runs import CARTPOLE, save
 
-from daedalus.launch import supervision
 from daedalus.launch.child_output import ChildOutput, Streams
 from daedalus.launch.local_run import LocalRun, RunFailedError
 from daedalus.launch.local_training import evaluate_run
@@ -28,18 +26,17 @@ from daedalus.policy.saving.saved_policy import checkpoints, read_policy
     ],
 )
 def test_an_evaluator_that_ends_without_a_report_is_named_each_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, how: str, reason: str
+    tmp_path: Path, program: str, how: str, reason: str
 ) -> None:
-    def start(_module: str, *_arguments: str, streams: Streams, **_: Any) -> subprocess.Popen[bytes]:
+    def start(module: str, *arguments: str, streams: Streams, one_thread: bool = False) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-S", "-c", program]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=streams.stdout, stderr=streams.stderr)
 
-    monkeypatch.setattr(supervision, "start", start)
     run = save(tmp_path / "run", CARTPOLE, 1)
     write_json(run / "summary.json", {})
     spec = read_policy(checkpoints(run)[0]).spec
     write_config(run, spec)
-    local_run = LocalRun(directory=run, spec=spec, started=0.0)
+    local_run = LocalRun(directory=run, spec=spec, started=0.0, start_player=start)
     with (
         ChildOutput(tmp_path / "output.log", print, print) as output,
         pytest.raises(RunFailedError, match=reason),
