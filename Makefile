@@ -69,7 +69,9 @@ docs: .venv/ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The parts of the documentation that are made from the code: a test fails while they differ.
+# `daedalus certs` describes itself only with its package.
 docs-reference: .venv/ready-train
+	$(PIP) -e ".[certs]"
 	$(BIN)/python docs/generate_reference.py
 	$(BIN)/python docs/trace_rollout.py
 

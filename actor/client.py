@@ -34,7 +34,7 @@ from daedalus.actor.session.actor_service import ActorService
 from daedalus.protocol import keys
 from daedalus.protocol.messages import MAX_ENVIRONMENTS, ClientReport
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import credentials_to_connect
+from daedalus.transport.credentials import credentials_to_connect, run_for
 
 
 class Clock:
@@ -164,7 +164,7 @@ class Client:
         config = ActorConfig(
             name=keys.check_name(name or own_name(identity, next(_numbers)), "actor name"),
             incarnation=secrets.randbits(62),
-            run=run,
+            run=run_for(credentials, run),
             link=link,
             timeout=timeout,
             searched_since=(began := time.monotonic()),
@@ -247,6 +247,7 @@ class Client:
         return ClientReport(
             actor=self._config.name,
             incarnation=self._config.incarnation,
+            rows=sum(agent.actions for agent in self.agents),
             deadlines=sum(clock.deadlines for clock in clocks),
             missed_deadlines=sum(clock.missed_deadlines for clock in clocks),
             overridden_actions=sum(agent.overridden_actions for agent in self.agents),

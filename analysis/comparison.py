@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.analysis.run_groups import Group, environment_of, text
+from daedalus.analysis.run_groups import Group, environment_of
 from daedalus.analysis.statistics import (
     Strata,
     improvement_interval,
@@ -19,6 +19,7 @@ from daedalus.analysis.statistics import (
     interquartile_mean,
     probability_of_improvement,
 )
+from daedalus.learner.run.settings import value_text
 from daedalus.protocol.texts import exact_number, one_line, printable, short_number
 
 
@@ -110,7 +111,9 @@ def _finite(env_steps: np.ndarray) -> int | None:
 def training_tasks(groups: Sequence[Group]) -> set[str]:
     """Return what makes the tasks that the runs train on differ from those of their evaluations, as texts."""
     played = [run.environment for group in groups for run in group.runs if run.environment is not None]
-    return {"" if task.trains_true_task else text([task.training_kwargs, task.no_reward_limit]) for task in played}
+    return {
+        "" if task.trains_true_task else value_text([task.training_kwargs, task.no_reward_limit]) for task in played
+    }
 
 
 def incomparable_returns(groups: Sequence[Group]) -> str:

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from daedalus.analysis.recorded_run import ENVIRONMENT, RecordedEvaluation, RunRecord
-from daedalus.analysis.run_results import episode_statistics, failure_counts, setting_text, statistics_rows, written
+from daedalus.analysis.run_results import episode_statistics, failure_counts, statistics_rows, written
+from daedalus.learner.run.settings import setting_text
 from daedalus.policy.saving.hub import LIBRARY
 from daedalus.policy.user_modules import allow_words, modules_of
 from daedalus.protocol.spec import RunSpec

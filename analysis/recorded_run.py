@@ -21,14 +21,14 @@ from pydantic import BaseModel, Field, ValidationError
 from daedalus.learner.reporting.metrics_rows import MAX_COLUMNS, lasting
 from daedalus.learner.reporting.thinning import bounded, line_bytes
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, EVENTS, METRICS, OUTPUT, SUMMARY, VERSIONS
-from daedalus.learner.run.run_files import RunDataError, read_json, read_toml
+from daedalus.learner.run.run_files import RunDataError, read_end, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
-from daedalus.protocol.texts import bounded_text, without_secrets
+from daedalus.protocol.texts import bounded_text
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
@@ -241,15 +241,6 @@ def _settings(path: Path) -> dict[str, Any]:
     return {path: value for path, value in _flat(settings).items() if _is_usable(path, value)}
 
 
-def default_settings_of(run: RecordedRun) -> dict[str, Any]:
-    """Return the default of each setting that has one, by `section.key`; empty for an environment without a name."""
-    try:
-        spec = RunSpec.model_validate({"environment": {"id": run.settings.get(ENVIRONMENT)}})
-    except ValidationError:
-        return {}
-    return {path: value for path, value in _flat(spec.model_dump(mode="json")).items() if path != ENVIRONMENT}
-
-
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of all sections by `section.key`."""
     return {
@@ -384,6 +375,12 @@ class RunRecord(RecordedRun):
         return "solved" if self.summary.get("solved") else "finished"
 
     @property
+    def bottleneck(self) -> str:
+        """What the run waited for, in one line; empty if it is not known."""
+        text = self.summary.get("bottleneck")
+        return bounded_text(text) if isinstance(text, str) else ""
+
+    @property
     def rejected(self) -> dict[str, int]:
         """Rejected rollouts of a run that has a summary, by cause."""
         causes = self.summary.get("rollouts_rejected")
@@ -419,7 +416,7 @@ def read_record(directory: Path, columns: Sequence[str] = ()) -> RunRecord:
         confirmation=confirmation if isinstance(confirmation, dict) else {},
         versions={name: str(value) for name, value in versions.items() if value is not None},
         events=events,
-        output=_end_of(directory / OUTPUT),
+        output=read_end(directory / OUTPUT, _MAX_OUTPUT_BYTES),
         video=_video(directory),
     )
 
@@ -446,17 +443,6 @@ def _evaluation(run: RecordedRun) -> RecordedEvaluation | None:
         raise RunDataError(
             f"{path} is damaged ({where}: {first['msg']}): write it again with: {run.record_command}"
         ) from None
-
-
-def _end_of(path: Path) -> str:
-    if path.is_symlink():
-        return ""
-    try:
-        with open_regular(path) as file:
-            file.seek(max(os.fstat(file.fileno()).st_size - _MAX_OUTPUT_BYTES, 0))
-            return without_secrets(file.read(_MAX_OUTPUT_BYTES).decode("utf-8", "replace").strip())
-    except OSError:
-        return ""
 
 
 def _video(directory: Path) -> Video | None:

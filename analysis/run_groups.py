@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from daedalus.analysis.recorded_run import ENVIRONMENT, SEED, RecordedRun, find_runs, read_run
 from daedalus.learner.run.run_files import RunDataError
-from daedalus.protocol.texts import exact_number
+from daedalus.learner.run.settings import value_text
 
 _SERVICE = "service."  # settings of how the learner runs, not of what it learns
 _FIRST = ("training.algorithm", "collection.upload", "collection.rollout_length")  # the names that say most
@@ -154,22 +154,13 @@ def _own_name(group: Sequence[RecordedRun]) -> str:
 
 def _text(group: Sequence[RecordedRun], key: str) -> str:
     """Return the values of a setting in a group."""
-    return "/".join(sorted({text(run.setting(key)) for run in group}))
-
-
-def text(value: Any) -> str:
-    """Return a value of a setting in few characters."""
-    if value is None:
-        return "unset"
-    if isinstance(value, float):
-        return exact_number(value)
-    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+    return "/".join(sorted({value_text(run.setting(key)) for run in group}))
 
 
 def _sortable(value: Any) -> tuple[int, float, str]:
     if isinstance(value, int | float):
         return 0, float(value), ""
-    return 1, 0.0, text(value)
+    return 1, 0.0, value_text(value)
 
 
 def select(

@@ -14,24 +14,24 @@ from pathlib import Path
 
 import numpy as np
 
-from daedalus.analysis.charts import SERIES_COLOURS, histogram, line_chart
 from daedalus.analysis.comparison import Comparison, cells, compare_groups, header, notes
-from daedalus.analysis.learning_curves import LARGEST, series_of
-from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, default_settings_of, finite
-from daedalus.analysis.run_groups import Group, environment_of, text
+from daedalus.analysis.learning_curves import LARGEST, Series, series_of
+from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite
+from daedalus.analysis.report_charts import LARGE, SERIES_COLOURS, SMALL, histogram, line_chart
+from daedalus.analysis.run_groups import Group, environment_of
 from daedalus.analysis.run_results import (
     EpisodeStatistics,
     episode_statistics,
     failed_events,
     failure_counts,
     interval_text,
-    setting_text,
     statistics_rows,
     together,
     written,
 )
 from daedalus.learner.reporting.metrics_rows import ENV, USER
 from daedalus.learner.run.run_directory import CONFIG
+from daedalus.learner.run.settings import changed_settings, setting_text, value_text
 from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
 from daedalus.protocol.texts import printable
 
@@ -64,7 +64,7 @@ Child = str | int | float | None | ET.Element | Iterable["Child"]
 
 
 def run_page(group: Group[RunRecord], by: str) -> str:
-    """Return the report of one run. Raises ModuleNotFoundError without matplotlib, as `comparison_page` does.
+    """Return the report of one run.
 
     Args:
       group: the run alone, with the name that the curves have.
@@ -84,9 +84,11 @@ def run_page(group: Group[RunRecord], by: str) -> str:
         _header(record.name, facts, record.status),
         element("p", unfinished, class_="note") if unfinished else None,
         summary_tiles(record),
-        _curves([group], by),
-        evaluation_section(record),
+        element("p", record.bottleneck, class_="muted") if record.bottleneck else None,
+        return_section([group], by),
         video_section(record),
+        evaluation_section(record),
+        _curves([group], by),
         orders_section(record),
         failure_section(record),
         settings_section(record),
@@ -134,8 +136,9 @@ def _environment_sections(
     heading = element("h2", environment, class_="environment") if named else None
     return [
         heading,
+        return_section(groups, by, environment if named else ""),
         comparison_section(comparison_of(groups, threshold)),
-        _curves(groups, by, of=environment if named else ""),
+        _curves(groups, by, environment if named else ""),
         runs_section(groups),
         differences_section(groups),
     ]
@@ -308,27 +311,27 @@ def failure_section(record: RunRecord) -> ET.Element:
 
 
 def settings_section(record: RunRecord) -> ET.Element:
-    """Return the settings of the run that are not the defaults, by their sections, and the others collapsed."""
-    defaults = default_settings_of(record)
-    chosen, others = {}, {}
-    for path, value in record.settings.items():
-        if path not in defaults or value != defaults[path]:
-            chosen[path] = "unset" if value is None else setting_text(value)
-        elif value is not None:
-            others[path] = setting_text(value)
-    summary = element("summary", f"{len(others)} settings with their default values")
+    """Return the settings of the run: those that differ from the defaults, and all others below a heading to open."""
+    changed = set(changed_settings(record.settings))
+    known = {path: value for path, value in record.settings.items() if value is not None}
+    others = {path: value for path, value in known.items() if path not in changed}
     return section(
-        "Settings",
-        _settings_columns(chosen, "settings") if chosen else None,
-        element("details", summary, _settings_columns(others, "default settings")) if others else None,
+        "Settings that differ from the defaults",
+        _settings_columns("settings", {path: value for path, value in known.items() if path in changed}),
+        element(
+            "details",
+            element("summary", f"{len(others)} settings at their defaults"),
+            _settings_columns("defaults", others),
+        ),
     )
 
 
-def _settings_columns(settings: Mapping[str, str], label: str) -> ET.Element:
+def _settings_columns(label: str, settings: Mapping[str, object]) -> ET.Element:
+    """Return a table of settings for each section. `label` says what they are, for screen readers."""
     parts: dict[str, list[tuple[str, str]]] = {}
     for path, value in settings.items():
         part, _, name = path.partition(".")
-        parts.setdefault(part, []).append((name, value))
+        parts.setdefault(part, []).append((name, setting_text(value)))
     columns = [
         element("div", element("h3", part), table((), rows, label=f"{label}: {part}"), class_="card")
         for part, rows in parts.items()
@@ -340,13 +343,22 @@ def versions_section(record: RunRecord) -> ET.Element | None:
     """Return the versions of the packages that the run was started with, or None if they are not recorded."""
     if not record.versions:
         return None
-    return section("Versions", table((), record.versions.items(), label="versions"))
+    versions = table((), record.versions.items(), label="versions")
+    return section("Versions", element("details", element("summary", f"{len(record.versions)} versions"), versions))
 
 
 def repeat_section(record: RunRecord) -> ET.Element:
     """Return the commands that train and evaluate the same again."""
-    train = shlex.join(["daedalus", "train", str(record.directory / CONFIG)])
-    return section("Do it again", element("pre", f"{train}\n{record.evaluate_command}", tabindex=0))
+    origin = record.versions.get("init_from")
+    others = ["--allow-other-spaces"] if record.versions.get("init_from_other_spaces") else []
+    begun = ["--init-from", origin, *others] if origin else []
+    train = shlex.join(["daedalus", "train", str(record.directory / CONFIG), *begun])
+    trust = "The run has code of its author: allow its modules only if you trust that code."
+    return section(
+        "Do it again",
+        element("pre", f"{train}\n{record.evaluate_command}", tabindex=0),
+        element("p", trust, class_="note") if "--allow-module" in record.evaluate_command else None,
+    )
 
 
 def comparison_of(groups: Sequence[Group], threshold: float | None) -> Comparison | None:
@@ -385,7 +397,7 @@ def runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element:
                 (
                     record.name,
                     group.name,
-                    text(record.settings.get("training.seed")),
+                    value_text(record.settings.get("training.seed")),
                     record.status,
                     written(record.number("env_steps")),
                     written(None if seconds is None else seconds / 60.0),
@@ -435,30 +447,54 @@ def versions_of_runs_section(groups: Sequence[Group[RunRecord]]) -> ET.Element |
     return section("Versions", table(head, rows, label="versions"))
 
 
-def _curves(groups: Sequence[Group], by: str, of: str = "") -> ET.Element:
-    """Return a chart of each column of the metrics that has values; `of` tells charts of the page apart."""
+def return_section(groups: Sequence[Group], by: str, of: str = "") -> ET.Element:
+    """Return the chart of the return, large, with its explanation; `of` tells charts of the page apart."""
     several = len(groups) > 1 or len(groups[0].runs) > 1
     band = "The band is one standard deviation of the newest episodes, circles are evaluations."
     if several:
         band = "A line of several runs is their interquartile mean, its band the 95 % bootstrap interval."
         if any(len(group.runs) == 1 for group in groups):
             band += " A line of one run has one standard deviation of the newest episodes, and circles for evaluations."
+    lines, colours = _lines(groups, RETURN, by)
+    # Two sizes, so that texts have the same size on a wide and on a narrow page: each shows one of them.
+    sizes = (("on-wide", LARGE), ("on-narrow", SMALL))
+    drawn = [
+        element("div", line_chart(_named(_TITLES[RETURN], of), lines, unit=by, colours=colours, size=size), class_=name)
+        for name, size in sizes
+        if lines
+    ]
+    nothing = None if lines else element("p", "No episode has ended: there is no return.", class_="note")
+    return section(
+        "Return",
+        _legend([_key_of(group, index) for index, group in enumerate(groups)]) if several else None,
+        nothing or element("figure", element("figcaption", _TITLES[RETURN]), drawn, class_="chart"),
+        element("p", band, class_="muted"),
+    )
+
+
+def _named(title: str, of: str) -> str:
+    return f"{of}: {title}" if of else title
+
+
+def _curves(groups: Sequence[Group], by: str, of: str = "") -> ET.Element | None:
+    """Return a chart of each other column of the metrics that has values, or None if there is none.
+
+    `of` tells charts of the page apart.
+    """
     columns = {name for group in groups for run in group.runs for name in run.metrics}
     own = sorted(name for name in columns if name.startswith((ENV, USER)))[:_MOST_OWN]
     charts = []
     for column, title in {**_TITLES, **{name: name for name in own}}.items():
-        found = [(series, index) for index, group in enumerate(groups) if (series := series_of(group, column, by))]
-        if any(column == RETURN or series.y.any() for series, _ in found):  # all 0: nothing of the kind happened
-            lines, colours = zip(*found, strict=True)
-            name = f"{of}: {title}" if of else title
-            chart = line_chart(name, lines, unit=by, colours=colours, wide=column == RETURN)
-            charts.append(_figure(title, chart, wide=column == RETURN))
-    return section(
-        "Learning curves",
-        element("p", band, class_="muted"),
-        _legend([_key_of(group, index) for index, group in enumerate(groups)]) if several else None,
-        element("div", charts, class_="charts"),
-    )
+        lines, colours = _lines(groups, column, by)
+        if column != RETURN and any(series.y.any() for series in lines):  # all 0: nothing of the kind happened
+            charts.append(_figure(title, line_chart(_named(title, of), lines, unit=by, colours=colours)))
+    return section("Learning curves", element("div", charts, class_="charts")) if charts else None
+
+
+def _lines(groups: Sequence[Group], column: str, by: str) -> tuple[list[Series], list[int]]:
+    """Return the lines of the groups that have values of a column, and their colours."""
+    found = [(series, index) for index, group in enumerate(groups) if (series := series_of(group, column, by))]
+    return [series for series, _ in found], [index for _, index in found]
 
 
 def _key_of(group: Group, index: int) -> tuple[str, int, bool]:
@@ -475,8 +511,8 @@ def _legend(keys: Iterable[tuple[str, int, bool]]) -> ET.Element:
     return element("ul", items, class_="legend")
 
 
-def _figure(title: str, chart: ET.Element, *, wide: bool = False) -> ET.Element:
-    return element("figure", element("figcaption", title), chart, class_="chart wide" if wide else "chart")
+def _figure(title: str, chart: ET.Element) -> ET.Element:
+    return element("figure", element("figcaption", title), chart, class_="chart")
 
 
 def _header(title: str, facts: Sequence[object], status: str | None) -> ET.Element:

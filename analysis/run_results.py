@@ -1,6 +1,5 @@
 """Results of one run, as a report and a model card show them: its evaluation, and what failed. Pure functions."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,11 +8,10 @@ import numpy as np
 
 from daedalus.analysis.comparison import Estimate
 from daedalus.analysis.recorded_run import RecordedEvaluation, RunRecord
-from daedalus.analysis.run_groups import text
 from daedalus.analysis.statistics import interquartile_mean, stratified_bootstrap
 from daedalus.learner.serving.events import RESTARTED, RESUMED, RecordedEvent
 from daedalus.learner.target_confirmation import mean_interval
-from daedalus.protocol.texts import short_number, without_secrets
+from daedalus.protocol.texts import short_number
 
 _REPETITIONS = 2000
 _MOST_VALUES = 4_000_000  # that the bootstrap draws in all, to limit its memory and its time
@@ -162,12 +160,6 @@ def statistics_rows(evaluation: RecordedEvaluation, statistics: EpisodeStatistic
 def interval_text(low: float, high: float) -> str:
     """Return the ends of an interval as a text; `-` if they are unknown."""
     return "-" if low != low or high != high else f"{written(low)} to {written(high)}"
-
-
-def setting_text(value: object) -> str:
-    """Return the value of a setting as text of limited length."""
-    shown = without_secrets(text(value) if not isinstance(value, dict | list) else json.dumps(value))
-    return shown if len(shown) <= 400 else f"{shown[:400]}..."
 
 
 def written(value: float | None) -> str:

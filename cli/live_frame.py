@@ -14,7 +14,7 @@ from rich.text import Text
 from daedalus.cli.run_watcher import WatchedRun
 from daedalus.learner.reporting.progress import duration
 from daedalus.protocol.messages import ActorStatus
-from daedalus.protocol.texts import one_line, policy_lag, short_number
+from daedalus.protocol.texts import one_line, policy_lag, short_number, short_rate
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 
@@ -67,11 +67,12 @@ def summary_frame(run: WatchedRun, width: int, *, ascii_only: bool = False) -> R
 def _run(run: WatchedRun, width: int, lines: int, ascii_only: bool) -> list[RenderableType]:
     """Return a run with as many actors as fit into `lines`."""
     status = run.status
-    problems = [_line([f"PROBLEM: {problem}"], width, "yellow") for problem in status.problems[:_SHOWN_PROBLEMS]]
-    lines = max(lines - len(problems), 0)
+    notes = [_line([f"PROBLEM: {problem}"], width, "yellow") for problem in status.problems[:_SHOWN_PROBLEMS]]
+    notes += [_line([status.bottleneck], width)] if status.bottleneck else []
+    lines = max(lines - len(notes), 0)
     shown = status.actors[:lines]
     more = status.fleet_size - len(shown)
-    parts: list[RenderableType] = [*_head(run, width, ascii_only), *problems]
+    parts: list[RenderableType] = [*_head(run, width, ascii_only), *notes]
     if shown:
         parts.append(_actors(shown, width, status.updates_per_batch))
     if more > 0:
@@ -97,13 +98,17 @@ def _head(run: WatchedRun, width: int, ascii_only: bool) -> list[RenderableType]
         progress,
         Text.assemble(label, (curve, "green"), no_wrap=True, overflow="crop"),
         _line(
-            [f"env_steps {status.env_steps:,}", f"{run.rate:,.0f}/s", f"of {status.env_steps_budget:,}"],
+            [
+                f"env_steps {status.env_steps:,}",
+                f"{short_rate(status.env_steps_per_second)}/s",
+                f"of {status.env_steps_budget:,}",
+            ],
             width,
         ),
         _line(
             [
                 f"updates {status.updates:,}",
-                f"{status.updates_per_second:,.0f}/s",
+                f"{short_rate(status.updates_per_second)}/s",
                 f"lag {policy_lag(status.policy_lag_mean, status.updates_per_batch)}",
                 *([f"{status.updates_skipped:,} skipped"] if status.updates_skipped else []),
                 f"rollouts {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
@@ -132,7 +137,7 @@ def _cells(actor: ActorStatus, updates_per_batch: int) -> dict[str, Text]:
         "actor": Text(one_line(actor.actor)),
         "state": Text("quarantined" if actor.quarantined else "alive" if actor.alive else "gone"),
         "env_steps": Text(f"{actor.env_steps:,}"),
-        "/s": Text(f"{actor.env_steps_per_second:,.0f}"),
+        "/s": Text(short_rate(actor.env_steps_per_second)),
         "lag": Text(policy_lag(actor.policy_lag, updates_per_batch).partition(" (")[0]),
         "busy": Text(f"{actor.busy_answers / max(answers, 1):.0%}"),
         "host": Text(one_line(actor.host)),

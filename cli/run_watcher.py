@@ -3,14 +3,14 @@
 import math
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 from daedalus.gateway.watching.learner_source import LearnerSource
-from daedalus.learner.reporting.progress import StepRate
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import MetricsReport, RunStatus
 from daedalus.transport.interface import RefusedError, Transport, TransportError
-from daedalus.transport.status_query import ask
+from daedalus.transport.status_query import survey
 
 _RETURN = "episode_return_mean"
 _MAX_RETURNS = 4096  # then every second one is dropped
@@ -22,20 +22,18 @@ class WatchedRun:
     def __init__(self, status: RunStatus) -> None:
         self.status = status
         self.returns: list[float] = []  # mean of the newest episodes, from the begin of the run on
-        self.rate = 0.0  # env_steps per second, over the last seconds
         self.next_row = 0  # of the metrics, not seen yet
-        self._meter = StepRate()
 
     @property
     def seconds_left(self) -> float | None:
         """Seconds until the budget is used up, or None if it is not known. A run may reach its target before."""
         left = self.status.env_steps_budget - self.status.env_steps
-        return max(left, 0) / self.rate if self.rate > 0.0 else None
+        rate = self.status.env_steps_per_second
+        return max(left, 0) / rate if rate > 0.0 else None
 
     def add_status(self, status: RunStatus) -> None:
         """Take a newer status of the same learner."""
         self.status = status
-        self.rate = self._meter.add(status.uptime_seconds, status.env_steps) or status.env_steps_per_second
 
     def add_rows(self, report: MetricsReport) -> None:
         """Take further rows of the metrics."""
@@ -63,18 +61,24 @@ class RunWatcher:
         self._runs: dict[int, WatchedRun] = {}  # by learner epoch
 
     def look(self) -> list[WatchedRun]:
-        """Return the runs whose learners answer. Raises TransportError or ProtocolError."""
+        """Return the runs whose learners can be read; the others are logged once. Raises TransportError."""
         runs: dict[int, WatchedRun] = {}
-        for status in ask(self._transport, self._run, max_actors=MAX_ACTORS):
+        found = survey(self._transport, self._run, max_actors=MAX_ACTORS)
+        found.log()
+        for status in found.statuses:
             run = runs[status.learner_epoch] = self._runs.get(status.learner_epoch) or WatchedRun(status)
             run.add_status(status)
-            for _ in range(_MOST_PAGES):
-                report = self._source.metrics(status, run.next_row)
-                if report is None or not len(report.numbers):
-                    break
-                run.add_rows(report)
+            with suppress(ProtocolError):  # of another release: without its curve
+                self._add_rows(run)
         self._runs = runs
         return sorted(runs.values(), key=lambda run: run.status.run)
+
+    def _add_rows(self, run: WatchedRun) -> None:
+        for _ in range(_MOST_PAGES):
+            report = self._source.metrics(run.status, run.next_row)
+            if report is None or not len(report.numbers):
+                break
+            run.add_rows(report)
 
 
 def looks(
@@ -104,8 +108,6 @@ def looks(
             while not stop.is_set() and (runs := watcher.look()):
                 yield runs
                 stop.wait(seconds)
-        except ProtocolError as error:
-            raise TransportError(f"the answer of the learner is damaged: {error}") from None
         except RefusedError:
             raise
         except TransportError:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from daedalus.actor.client import Client
     from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-    from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
+    from daedalus.actor.evaluation.loaded_policy import Decisions, Policy, load_policy
     from daedalus.actor.evaluation.video import VideoError
     from daedalus.analysis.recorded_run import read_metrics
     from daedalus.launch.callbacks import Callback, TrainingRun
@@ -31,6 +31,7 @@ __all__ = [
     "Callback",
     "Client",
     "DamagedError",
+    "Decisions",
     "EnvironmentSetupError",
     "EvaluationResult",
     "HubError",
@@ -53,6 +54,7 @@ __all__ = [
 _MODULES = {
     "Callback": "daedalus.launch.callbacks",
     "Client": "daedalus.actor.client",
+    "Decisions": "daedalus.actor.evaluation.loaded_policy",
     "DamagedError": "daedalus.policy.saving.sealed",
     "EnvironmentSetupError": "daedalus.actor.environments.environment_errors",
     "EvaluationResult": "daedalus.launch.evaluation",

@@ -27,7 +27,7 @@ PYTHON_API = {
         "RunDataError",
     ),
     "Use a trained policy": (
-        *("evaluate", "EvaluationResult", "load_policy", "Policy", "NoPolicyError", "DamagedError"),
+        *("evaluate", "EvaluationResult", "load_policy", "Policy", "Decisions", "NoPolicyError", "DamagedError"),
         *("EnvironmentSetupError", "HubError", "VideoError"),
     ),
     "Client": ("Client", "daedalus.actor.collecting.client_agent.ClientAgent"),

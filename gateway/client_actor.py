@@ -143,6 +143,7 @@ class ClientActor:
         """Take a choice; return False if the policy must choose once more, after a reset row."""
         if not self.rows.take_choice(choice):
             return False
+        self.uploads.rows += 1
         if self._override is None:
             self._on_action(self.spaces.action(self.rows.env_action(choice.actions)))
         else:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from daedalus.actor.session.conversation import Query
-from daedalus.actor.session.uploading import Reports, Uploads
+from daedalus.actor.session.uploading import ACTOR_PAUSE_SECONDS, Reports, Uploads
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Join, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -47,7 +47,8 @@ class ClientUploads:
         self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
         self._sequence = 0  # of the next rollout
         self._dropped = 0  # rollouts that were never sent
-        self.overridden_actions = 0  # for the status
+        self.rows = self.overridden_actions = 0  # for the status
+        self._sent_at = 0.0  # the last rollout
 
     def begin(self, session: Welcome) -> None:
         """Send to a learner epoch that has no rollouts of this client; those for an earlier one are dropped."""
@@ -88,14 +89,17 @@ class ClientUploads:
         with self._sender.lock:
             self._uploads.in_flight.add(self._sequence, payload)
         self._sequence += 1
+        self._sent_at = time.monotonic()
         self._send_rollouts()
 
     def send_due(self) -> None:
         """Send again what is due, and report what the status shows of the client."""
         if self._uploads.in_flight.rollouts:
             self._send_rollouts()
-        if self._session is not None and (self.overridden_actions or self._dropped):
-            for query in self._reports.take_due(self._session.run, time.monotonic()):
+        now = time.monotonic()
+        is_slow = now > self._sent_at + ACTOR_PAUSE_SECONDS  # of others, the rollouts are signs of life
+        if self._session is not None and (self.overridden_actions or self._dropped or is_slow):
+            for query in self._reports.take_due(self._session.run, now):
                 self._sender.send(query)
 
     def _send_rollouts(self) -> None:
@@ -108,6 +112,7 @@ class ClientUploads:
         return ClientReport(
             actor=self._join.actor,
             incarnation=self._join.incarnation,
+            rows=self.rows,
             overridden_actions=self.overridden_actions,
             rollouts_dropped=self._dropped,
         )

@@ -21,7 +21,7 @@ from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.watching.camera import CameraProcess
 from daedalus.gateway.watching.learner_source import LearnerSource
 from daedalus.gateway.watching.monitor import RunMonitor
-from daedalus.gateway.watching.page_data import Observation, OtherRun, PageData
+from daedalus.gateway.watching.page_data import Observation, OtherRun, PageData, ReadFolder
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import Order
 from daedalus.transport.connecting import connect_with_retry
@@ -54,6 +54,7 @@ class GatewaySettings:
     operator_token: OperatorToken | None = None
     takes_clients: bool = True  # or the page only
     other_runs: Callable[[], list[OtherRun]] = lambda: []
+    read_folder: ReadFolder = lambda run: None
     camera: tuple[str, ...] | None = None  # command of the camera's process; None: no camera
     announce: Callable[[str], None] | None = None  # receives the address of the page, instead of the log
 
@@ -171,7 +172,7 @@ class GatewayService:
             except (TransportError, ProtocolError) as error:
                 return False, str(error)
 
-        self._monitor = RunMonitor(source, show, lambda: gateway.run.last_end)
+        self._monitor = RunMonitor(source, show, lambda: gateway.run.last_end, self._settings.read_folder)
         gateway.run.on_change = self._monitor.look
         self._data.on_watch, self._data.give_order = self._monitor.watch, give
         self._monitor.watch(self._data.is_watched)
@@ -179,12 +180,17 @@ class GatewayService:
 
     async def _close(self) -> None:
         """Close all parts side by side: each may wait for some seconds."""
-        closing = [self._close_gateway()]
+        closing = [self._close_gateway(), self._close_page()]
         if self._camera is not None:
             closing.append(self._camera.close())
-        if self._monitor is not None:
-            closing.append(asyncio.to_thread(self._monitor.close))
         await asyncio.gather(*closing)
+
+    async def _close_page(self) -> None:
+        """Leave the pages that are open with the end of the run."""
+        if self._monitor is None:
+            return
+        await asyncio.to_thread(self._monitor.close)
+        await self._data.close(await asyncio.to_thread(self._monitor.last_look))
 
     async def _close_gateway(self) -> None:
         if self._gateway.done():

@@ -9,7 +9,8 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -28,13 +29,21 @@ from daedalus.protocol import keys
 from daedalus.protocol.messages import Welcome
 from daedalus.transport.addresses import socket_path
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect
+from daedalus.transport.credentials import (
+    SECURITY_ERRORS,
+    Credentials,
+    NotValidNowError,
+    credentials_to_connect,
+    run_for,
+)
 from daedalus.transport.interface import TransportError, UnreachableError
 from daedalus.transport.retries import Retries
 
 _logger = logging.getLogger(__name__)
 
 _REPORTED = (ActorError, EnvironmentSetupError, PolicyError, TransportError)  # each in one line
+_LEAVE_SECONDS = 30.0  # for the present rollout to be finished and uploaded: the notice of some spot machines
+_LATE_SECONDS = 0.5  # after which an actor that has not left in time is stopped: a step does not return
 _NEXT_RUN_SECONDS = 2.0  # after a run, before the next is looked for: its learner may answer for some seconds more
 
 
@@ -56,7 +65,7 @@ class ActorOptions:
     allowed_modules: frozenset[str] = frozenset()
 
     def config(self, credentials: Credentials | None) -> ActorConfig:
-        """Return the checked configuration. Raises ValueError with a message of one line."""
+        """Return the checked configuration. Raises ValueError or CredentialsError with a message of one line."""
         if self.environments is not None and not 1 <= self.environments <= 4096:
             raise ValueError(f"--envs is {self.environments}: choose a number from 1 to 4096")
         if self.run != keys.ANY_RUN:
@@ -70,7 +79,7 @@ class ActorOptions:
         return ActorConfig(
             name=keys.check_name(name, "actor name"),
             incarnation=secrets.randbits(62),
-            run=self.run,
+            run=run_for(credentials, self.run),
             environments=self.environments,
             runtime=self.runtime,
             modules=UserModules(self.allowed_modules, "the learner"),
@@ -81,13 +90,62 @@ class ActorOptions:
         )
 
 
-def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, str]) -> int:
+class LeaveRequest:
+    """Request to this process to leave, because its host is about to end. Any thread may use it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._by: float | None = None  # on the monotonic clock; None: there was no request
+        self._role: Evaluator | ActorService | None = None  # that takes part in a run
+        self._timer: threading.Timer | None = None
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether there was a request."""
+        return self._by is not None
+
+    def ask(self, stop: threading.Event) -> None:
+        """Let the process finish its rollout and upload it, for 30 s at most. It ends at once if it has none.
+
+        `stop` ends the process in any case.
+        """
+        with self._lock:
+            if self._by is not None:
+                return
+            self._by = time.monotonic() + _LEAVE_SECONDS
+            _logger.info("asked by a signal to leave: the present rollout has %.0f s", _LEAVE_SECONDS)
+            if self._role is None:
+                stop.set()
+                return
+            self._role.leave(self._by)
+            self._timer = threading.Timer(_LEAVE_SECONDS + _LATE_SECONDS, stop.set)
+            self._timer.daemon = True
+            self._timer.start()
+
+    @contextmanager
+    def reaching(self, role: Evaluator | ActorService) -> Iterator[None]:
+        """Let requests reach what takes part in a run."""
+        with self._lock:
+            self._role = role
+            if self._by is not None:  # while it connected
+                role.leave(self._by)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._role = None
+                if self._timer is not None:
+                    self._timer.cancel()
+
+
+def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, str], leave: LeaveRequest) -> int:
     """Run an actor, report why it fails, and return the exit status.
 
     Args:
       options: what the process was started with.
       stop: ends the actor.
       context: receives the fields of the log.
+      leave: ends the actor after its rollout.
     """
     retries = Retries(stop)
     while True:
@@ -108,7 +166,7 @@ def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, s
 
     while True:
         try:
-            finished = _serve_run(options, config, credentials, stop, note)
+            finished = _serve_run(options, config, credentials, stop, leave, note)
         except Exception as error:  # broad: see _is_of_others
             if not options.stay or not _is_of_others(error):
                 if not isinstance(error, _REPORTED):
@@ -117,9 +175,9 @@ def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, s
                 return FAILED
             if not isinstance(error, _REPORTED):
                 _logger.exception("a module of the run has failed")
-            stopped = retries.wait(str(error) or type(error).__name__)
+            stopped = leave.is_asked or retries.wait(str(error) or type(error).__name__)
         else:
-            if not (finished and options.stay):
+            if leave.is_asked or not (finished and options.stay):
                 return 0
             retries.succeeded()
             _logger.info("waiting for the next run")
@@ -148,6 +206,7 @@ def _serve_run(
     config: ActorConfig,
     credentials: Credentials | None,
     stop: threading.Event,
+    leave: LeaveRequest,
     on_join: Callable[[Welcome], None],
 ) -> bool:
     """Take part in one run; return whether the run finished. Raises what `main` reports."""
@@ -156,7 +215,8 @@ def _serve_run(
     if transport is None:
         return False
     try:
-        role = Evaluator if options.evaluator else ActorService
-        return role(config, transport, stop, on_join=on_join).run()
+        role = (Evaluator if options.evaluator else ActorService)(config, transport, stop, on_join=on_join)
+        with leave.reaching(role):
+            return role.run()
     finally:
         transport.close()

@@ -48,8 +48,11 @@ class CheckpointValues:
         if newest is None or newest == self._loaded:
             return
         try:
-            from daedalus.policy.acting.value_estimator import ValueEstimator  # imports torch
+            import torch
 
+            from daedalus.policy.acting.value_estimator import ValueEstimator
+
+            torch.set_num_threads(1)
             self._estimate = ValueEstimator(read_policy(newest), self._modules)
         except ImportError:
             _logger.debug("there are no value estimates without torch")

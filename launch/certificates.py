@@ -22,7 +22,7 @@ import json
 import shutil
 import socket
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from cryptography import x509
@@ -33,7 +33,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from daedalus.gateway.security import OPERATOR, TOKENS, digest, new_token
 from daedalus.policy.saving.regular_files import replace_text, replacing
 from daedalus.protocol import keys
-from daedalus.transport.access_control import common_name
+from daedalus.transport.access_control import common_name, parse_common_name
 from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, KEY, Credentials, CredentialsError
 from daedalus.transport.zenoh_settings import Capacity, as_config_file, session_settings
 
@@ -247,7 +247,7 @@ class ClientTokens:
 
 LISTENERS = ("learner", "router", "gateway")
 _ZENOH_LISTENERS = ("learner", "router")
-CLIENT_ROLES = ("actor", "operator")
+_MAX_COMMON_NAME = 64  # of X.509
 
 _CA_LIFETIME = datetime.timedelta(days=3650)
 _ZENOHD = "zenoh.json5"
@@ -260,17 +260,31 @@ class Identity:
     """Who a certificate is for."""
 
     role: str
-    name: str = ""  # of an actor or operator
+    name: str = ""  # of an actor or operator; of a learner, the run that it is for
+    run: str = field(default="", compare=False)  # of an actor or operator that is for certain runs
+
+    @classmethod
+    def of(cls, text: str) -> "Identity":
+        """Return the identity that a common name stands for."""
+        role, name, run = parse_common_name(text)
+        return cls(role, run) if role == "learner" else cls(role, name, run)
+
+    @property
+    def listens(self) -> bool:
+        """Whether the certificate is for listening."""
+        return self.role in LISTENERS and not self.name
 
     @property
     def folder(self) -> str:
         """Name of the folder of this identity."""
-        return self.role if self.name in ("", self.role) else f"{self.role}-{self.name}"
+        if self.name and (self.name != self.role or self.role == "learner"):
+            return f"{self.role}-{self.name}"
+        return self.role
 
     @property
     def common_name(self) -> str:
         """Common name in the certificate."""
-        return common_name(self.role, self.name)
+        return common_name(self.role, self.name, self.name if self.role == "learner" else self.run)
 
 
 class CertificateFolder:
@@ -300,8 +314,7 @@ class CertificateFolder:
         found = {}
         for path in sorted((self.directory / "ca").glob(f"*/{CERTIFICATE}")):
             issued = read_issued(path)
-            role, _, name = issued.common_name.partition(":")
-            found[Identity(role, name)] = issued
+            found[Identity.of(issued.common_name)] = issued
         return found
 
     def issue(self, identities: list[Identity], lifetime: datetime.timedelta, hosts: list[str] | None = None) -> None:
@@ -314,14 +327,19 @@ class CertificateFolder:
             _check_name(identity)
         _check_hosts(hosts or [])
         _check_number({*self.identities(), *identities})
+        known = {identity: identity for identity in self.identities()}
         for identity in identities:
+            before = known.get(identity, identity)
+            identity = replace(identity, run=identity.run or before.run)
             record, folder = self.directory / "ca" / identity.folder, self.directory / identity.folder
-            if identity.role in _ZENOH_LISTENERS:
+            if before.run != identity.run:
+                shutil.rmtree(record)  # the issuer has the run in its name
+            if identity.listens and identity.role != "gateway":
                 authority = self._ca
                 record.mkdir(exist_ok=True)
             else:
                 authority = self._issuer(record, identity)
-            for_hosts = self._hosts(identity, hosts) if identity.role in LISTENERS else []
+            for_hosts = self._hosts(identity, hosts) if identity.listens else []
             authority.issue(folder, identity.common_name, for_hosts, lifetime)
             shutil.copyfile((record if identity.role == "gateway" else self.directory / "ca") / CA, folder / CA)
             shutil.copyfile(folder / CERTIFICATE, record / CERTIFICATE)
@@ -360,7 +378,7 @@ class CertificateFolder:
         issuers = [
             self.directory / "ca" / identity.folder / CA
             for identity in sorted(self.identities())
-            if identity.role in CLIENT_ROLES
+            if not identity.listens
         ]
         content = "".join(path.read_text("ascii") for path in (self.directory / "ca" / CA, *issuers))
         for role in _ZENOH_LISTENERS:
@@ -383,7 +401,7 @@ def _check_hosts(hosts: list[str]) -> None:
 
 
 def _check_number(identities: set[Identity]) -> None:
-    clients = [identity for identity in identities if identity.role in CLIENT_ROLES]
+    clients = [identity for identity in identities if not identity.listens]
     if sum(len(client.common_name) + _SUBJECT_OVERHEAD for client in clients) > _MAX_SUBJECT_BYTES:
         raise CredentialsError(
             f"{len(clients)} certificates are more than a listener can accept: issue one for each host, whose actors "
@@ -392,11 +410,12 @@ def _check_number(identities: set[Identity]) -> None:
 
 
 def _check_name(identity: Identity) -> None:
-    if identity.role in LISTENERS:
-        return
-    keys.check_name(identity.name, f"{identity.role} name")
-    first, dot, _ = identity.name.partition(".")
-    if dot:
+    for name in filter(None, (identity.name, identity.run)):
+        keys.check_name(name, f"{identity.role} name" if name == identity.name else "run")
+        first, dot, _ = name.partition(".")
+        if dot:
+            raise CredentialsError(f"{name!r} has a '.': name it {first!r}, which may also act as {name!r}")
+    if len(identity.common_name) > _MAX_COMMON_NAME:
         raise CredentialsError(
-            f"{identity.name!r} has a '.': name it {first!r}, which may also act as {identity.name!r}"
+            f"the names are too long: {identity.common_name!r} has more than {_MAX_COMMON_NAME} characters"
         )

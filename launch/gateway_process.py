@@ -11,7 +11,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daedalus.actor.errors import ActorError
@@ -19,6 +19,7 @@ from daedalus.gateway.security import OperatorToken
 from daedalus.gateway.watching.page_data import OtherRun
 from daedalus.launch.logs import print_error, say
 from daedalus.launch.process_lifecycle import BAD_USAGE
+from daedalus.launch.watched_folder import WatchedFolder
 from daedalus.learner.reporting.metrics_rows import read_rows
 from daedalus.learner.reporting.thinning import MetricsHistory
 from daedalus.learner.run.run_directory import METRICS
@@ -26,7 +27,14 @@ from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys
 from daedalus.transport.addresses import AddressError, check_listening
-from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, NotValidNowError, credentials_to_connect, load
+from daedalus.transport.credentials import (
+    SECURITY_ERRORS,
+    Credentials,
+    NotValidNowError,
+    credentials_to_connect,
+    load,
+    run_for,
+)
 from daedalus.transport.interface import TransportError
 from daedalus.transport.retries import Retries
 
@@ -55,7 +63,7 @@ class GatewayOptions:
     insecure: bool = False
     compare: list[Path]  # run directories whose curves the page shows
     camera: bool = True
-    checkpoints: Path | None = None  # run directory, for value estimates of the camera
+    run_directory: Path | None = None  # of the run, for what the page shows of it
     allowed_modules: Sequence[str] = ()
     takes_clients: bool = True
     for_a_person: bool = False  # print the address of the page for the person who started the run
@@ -130,6 +138,7 @@ def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
             if options.run != keys.ANY_RUN:
                 keys.check_name(options.run, "run")
             chosen = _Chosen.of(options)
+            options = replace(options, run=run_for(chosen.operator, run_for(chosen.credentials, options.run)))
             host, port = _listening_address(options.listen, chosen.serving is not None, options.insecure)
             break
         except NotValidNowError as error:
@@ -162,7 +171,8 @@ def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
 
 def _camera(options: GatewayOptions) -> tuple[str, ...]:
     """Return the command of the camera's process."""
-    values = [] if options.checkpoints is None else ["--checkpoints", str(options.checkpoints)]
+    directory = options.run_directory
+    values = [] if directory is None else ["--checkpoints", str(directory)]
     return (
         sys.executable,
         "-P",
@@ -197,6 +207,7 @@ async def _serve(options: GatewayOptions, chosen: "_Chosen", listener: socket.so
         origins=options.origins,
         operator_token=chosen.operator_token,
         other_runs=chosen.other_runs,
+        read_folder=(lambda run: None) if options.run_directory is None else WatchedFolder(options.run_directory),
         camera=_camera(options) if options.camera else None,
         takes_clients=options.takes_clients,
         announce=_announce(options.operator_token) if options.for_a_person else None,

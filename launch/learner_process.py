@@ -62,6 +62,7 @@ from daedalus.transport.credentials import (
     certificate_days_left,
     credentials_to_connect,
     credentials_to_listen,
+    run_for,
 )
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.private_address import private_address
@@ -218,6 +219,7 @@ class LearnerProcess:
         self._options, self._stop, self._user_metrics = options, stop, user_metrics
         self._credentials = options.network.credentials()
         self._run = choose_run(options)
+        run_for(self._credentials, run_directory.run_name(self._run.directory))
         display = Progress if options.shows_progress else SilentProgress
         training = self._run.spec.training
         self._progress = display(sys.stdout, training.env_steps, training.updates_per_batch)

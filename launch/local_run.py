@@ -78,6 +78,7 @@ class LocalRun:
     watch: bool = False  # start a gateway with the page of the run
     camera: bool = True  # with a camera
     clients: bool = False  # with the page, let clients take part
+    keeps_page: bool = False  # keep the page when the run has ended, until the user stops it
     log: Sequence[str] = ()  # trackers that the run is logged to
     observer: RunObserver = field(default_factory=RunObserver)
     start_player: StartPlayer = start  # starts actors, evaluators and evaluations
@@ -138,10 +139,10 @@ def actor_arguments(run: LocalRun) -> tuple[str, ...]:
 
 def gateway_arguments(run: LocalRun) -> tuple[str, ...]:
     """Return the arguments of the gateway with the page."""
-    filming = [*allow_settings(run.spec.user_modules), "--checkpoints", str(run.directory)]
-    camera = filming if run.camera else ["--no-camera"]
+    camera = allow_settings(run.spec.user_modules) if run.camera else ["--no-camera"]
+    folder = ("--run-dir", str(run.directory))
     token = ("--operator-token", str(run.directory / run_directory.OPERATOR_TOKEN))
-    return *helper_log_words(run.logs), *token, *camera, *([] if run.clients else ["--page-only"])
+    return *helper_log_words(run.logs), *token, *folder, *camera, *([] if run.clients else ["--page-only"])
 
 
 def helper_log_words(logs: LogOptions) -> list[str]:

@@ -4,7 +4,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -177,8 +177,18 @@ def _warn(message: str | None, record: EventFile) -> None:
         record.add_restart(message)
 
 
+def _keep(page: Sequence[Supervised], stopping: threading.Event) -> None:
+    """Wait until the user stops the page, or until it has ended."""
+    while any(gateway.process.poll() is None for gateway in page) and not stopping.wait(_POLL_SECONDS):
+        pass
+
+
 def run_locally(
-    run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams = inherited
+    run: LocalRun,
+    stopping: threading.Event,
+    output: ChildOutput,
+    learner_streams: OpenStreams = inherited,
+    on_end: Callable[[RunEnd], None] = lambda end: None,
 ) -> RunEnd:
     """Train until the target or the end of the budget, then evaluate the best checkpoint.
 
@@ -189,26 +199,34 @@ def run_locally(
       stopping: ends the run early when it is set.
       output: reads what the actors and the evaluations write.
       learner_streams: where the learner writes its log and its progress.
+      on_end: called with the result, while the page still shows the run.
 
     Raises RunFailedError or RunStoppedError.
     """
     page: list[Supervised] = []
     trackers = TrackerProcesses(run.log, run.directory, output, log_json=run.logs.as_json)
     try:
-        if run.trained is None:
-            status = train(run, stopping, output, learner_streams, page, trackers)
-        else:
-            trackers.start()
-            status = run.trained
-        if stopping.is_set():
-            raise RunStoppedError
-        if status == ORDERED:
-            raise RunStoppedError(_stopped_by(run))
-        if status == UNSAVED:
-            raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
-        if status not in FINISHED:
-            raise RunFailedError(status=status)
-        return RunEnd(status=status, summary=evaluate_run(run, stopping, output, learner_streams))
+        try:
+            if run.trained is None:
+                status = train(run, stopping, output, learner_streams, page, trackers)
+            else:
+                trackers.start()
+                status = run.trained
+            if stopping.is_set():
+                raise RunStoppedError
+            if status == ORDERED:
+                raise RunStoppedError(_stopped_by(run))
+            if status == UNSAVED:
+                raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
+            if status not in FINISHED:
+                raise RunFailedError(status=status)
+            end = RunEnd(status=status, summary=evaluate_run(run, stopping, output, learner_streams))
+        finally:
+            trackers.finish(stopping)
+        on_end(end)
+        if run.keeps_page:
+            _keep(page, stopping)
+        return end
     except FailedError as error:
         if stopping.is_set():
             raise RunStoppedError from None
@@ -218,7 +236,6 @@ def run_locally(
         raise
     finally:
         stop([gateway.process for gateway in page])  # until now it has shown the result
-        trackers.finish(stopping)
         if run.watch:
             with suppress(OSError):
                 (run.directory / run_directory.OPERATOR_TOKEN).unlink()

@@ -31,6 +31,7 @@ UNSAVED = 6  # exit status of a supervised learner whose last checkpoint could n
 SUPERSEDED = 7  # exit status of a learner that a newer one of its run has replaced: it must not be started again
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
 UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # errors of a full disk, and of a terminal that was closed
+_LEAVE = getattr(signal, "SIGUSR1", None)  # Windows has none
 _STUCK_SECONDS = 4.0  # in one call after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
 _THREADS_SECONDS = 1.0  # for threads that are not ours, at the end
@@ -103,9 +104,15 @@ class _Stop(threading.Event):
 
 
 def stop_on_signals(
-    *, exit_if_stuck: bool = False, stuck_seconds: float = _STUCK_SECONDS, end_seconds: float = _END_SECONDS
+    *,
+    exit_if_stuck: bool = False,
+    stuck_seconds: float = _STUCK_SECONDS,
+    end_seconds: float = _END_SECONDS,
+    on_leave: Callable[[threading.Event], None] | None = None,
 ) -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
+
+    `on_leave` is called with the event after SIGUSR1, on a thread of its own.
 
     The process can so close its resources before it ends. A thread sets the event, not the signal handlers. Python
     calls no handler while the main thread runs native code, such as a simulator or a policy. And a handler may
@@ -121,12 +128,16 @@ def stop_on_signals(
         while number := os.read(reader, 1):
             if number[0] in (signal.SIGTERM, signal.SIGINT):
                 stop.set()
+            elif number[0] == _LEAVE and on_leave is not None:
+                on_leave(stop)
 
     reader, writer = os.pipe()
     if hasattr(os, "set_blocking"):  # Windows with Python 3.11 has none, and does not require it
         os.set_blocking(writer, False)
     signal.signal(signal.SIGTERM, _ignore)
     signal.signal(signal.SIGINT, _ignore)
+    if _LEAVE is not None and on_leave is not None:
+        signal.signal(_LEAVE, _ignore)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # the interpreter writes each signal's number at once
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see interrupts_held
@@ -141,10 +152,15 @@ def stop_on_signals(
 
 
 def _default_signals() -> None:
-    """Undo `stop_on_signals` in a fork, such as a process of an environment: a signal shall end it."""
+    """Undo `stop_on_signals` in a fork, such as a process of an environment: a signal shall end it.
+
+    Not SIGUSR1, which some supervisors send to all processes of an actor: its rollout needs them.
+    """
     signal.set_wakeup_fd(-1)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_DFL)
+    if _LEAVE is not None and signal.getsignal(_LEAVE) is _ignore:
+        signal.signal(_LEAVE, signal.SIG_IGN)
 
 
 def _ignore(_number: int, _frame: object) -> None:

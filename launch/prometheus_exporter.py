@@ -19,14 +19,14 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import FAILED
-from daedalus.protocol.codec import ProtocolError
+from daedalus.protocol import keys
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import Credentials, certificate_days_left
+from daedalus.transport.credentials import Credentials, certificate_days_left, run_for
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.retries import Retries
 from daedalus.transport.slow_calls import SlowCall
-from daedalus.transport.status_query import ask, newest_of_each_run
+from daedalus.transport.status_query import Survey, newest_of_each_run, survey
 from daedalus.transport.zenoh_session import PeerCertificate, peer_certificate
 
 _logger = logging.getLogger(__name__)
@@ -100,6 +100,11 @@ class MetricsServer(ThreadingMixIn, WSGIServer):
         """Say nothing of a client that has left or was too slow."""
 
 
+def _known_rate(run: RunStatus, rate: float) -> float | None:
+    """Return a rate, or None while the first batch is awaited: 0 means that no update comes any more."""
+    return rate or (0.0 if run.problems else None)
+
+
 _Family = type[CounterMetricFamily] | type[GaugeMetricFamily]
 
 _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], ...] = (
@@ -116,16 +121,33 @@ _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], 
         GaugeMetricFamily,
         "env_steps_per_second",
         "Recent environment steps per second.",
-        lambda run: run.env_steps_per_second,
+        lambda run: _known_rate(run, run.env_steps_per_second),
     ),
     (CounterMetricFamily, "updates", "Optimiser steps.", lambda run: run.updates),
-    (GaugeMetricFamily, "updates_per_second", "Recent optimiser steps per second.", lambda run: run.updates_per_second),
+    (
+        GaugeMetricFamily,
+        "updates_per_second",
+        "Recent optimiser steps per second.",
+        lambda run: _known_rate(run, run.updates_per_second),
+    ),
     (CounterMetricFamily, "updates_skipped", "Updates skipped: gradient not finite.", lambda run: run.updates_skipped),
     (
         GaugeMetricFamily,
         "episode_return_mean",
         "Mean return of the newest episodes.",
         lambda run: run.episode_return_mean,
+    ),
+    (
+        GaugeMetricFamily,
+        "learning_share",
+        "Recent share of the time in which the learner computed updates.",
+        lambda run: run.learning_share,
+    ),
+    (
+        GaugeMetricFamily,
+        "decoding_share",
+        "Recent share of the time in which the learner decoded rollouts.",
+        lambda run: run.decoding_share,
     ),
     (GaugeMetricFamily, "policy_lag_updates", "Recent mean policy lag.", lambda run: run.policy_lag_mean),
     (CounterMetricFamily, "rollouts_accepted", "Rollouts accepted.", lambda run: run.rollouts_accepted),
@@ -146,8 +168,32 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
     (
         GaugeMetricFamily,
         "actor_silence_seconds",
-        "Time since the learner last heard from the actor.",
+        "Time since the last sign of life of the actor: a rollout or a report.",
         lambda actor: actor.seconds_since_seen,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_silence_limit_seconds",
+        "Silence above it is unusual for this actor.",
+        lambda actor: actor.silence_limit_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_rollout_seconds",
+        "Duration of one of its newest rollouts; 0: unknown.",
+        lambda actor: actor.rollout_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_waiting_seconds",
+        "Its wait from one rollout to the next.",
+        lambda actor: actor.waiting_seconds,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_round_trip_seconds",
+        "Round trip of a small request; 0: unknown.",
+        lambda actor: actor.round_trip_seconds,
     ),
     (GaugeMetricFamily, "actor_environments", "Environments of the actor.", lambda actor: actor.environments),
     (
@@ -186,8 +232,10 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
 )
 
 
-def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
+def metrics(statuses: Iterable[RunStatus], unread: Iterable[str] = ()) -> Iterator[Metric]:
     """Yield all metrics of the runs that answered, or only `daedalus_up` 0 if no run answered.
+
+    `unread` are runs whose learners answered, but cannot be read: they have one metric.
 
     Actors that are gone have no series of their own. They are only counted, by their state, and after a minute only in
     the counters of the run. Of several learners of one run, the newest has series.
@@ -195,6 +243,10 @@ def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
     statuses = list(statuses)
     runs = newest_of_each_run(statuses)
     yield GaugeMetricFamily("daedalus_up", "1 if a learner answers, else 0.", value=bool(runs))
+    others = GaugeMetricFamily("daedalus_unreadable", "1 for a run whose learner cannot be read.", labels=["run"])
+    for name in unread:
+        others.add_metric([name], 1)
+    yield others
     info = GaugeMetricFamily(
         "daedalus_run_info", "Environment and algorithm of the run.", labels=["run", "environment", "algorithm"]
     )
@@ -234,7 +286,7 @@ class CertificateDays:
     def __init__(self, endpoints: list[str], credentials: Credentials | None) -> None:
         self._endpoints = [] if credentials is None else endpoints
         self._credentials = credentials
-        self._learners: dict[str, tuple[float, float]] = {}  # by run: when it expires, and when the learner answered
+        self._learners: dict[str, tuple[float, float]] = {}  # by run: the days left, and when the learner said so
         self._listeners: dict[str, PeerCertificate] = {}  # by address
 
     def follow(self, stop: threading.Event) -> None:
@@ -249,11 +301,11 @@ class CertificateDays:
 
     def metric(self, runs: Iterable[RunStatus]) -> Metric:
         """Return the days as one metric; those of a learner also for a week after it has gone."""
-        now = time.time()
+        now = time.monotonic()
         for run in runs:
             if run.certificate_days_left is not None:
                 self._learners.pop(run.run, None)
-                self._learners[run.run] = now + run.certificate_days_left * _DAY, now
+                self._learners[run.run] = run.certificate_days_left, now
         self._learners = {
             run: known for run, known in list(self._learners.items())[-_MAX_RUNS:] if now < known[1] + _KEPT_SECONDS
         }
@@ -262,8 +314,8 @@ class CertificateDays:
             "Days until a certificate expires; negative if it has expired.",
             labels=["run", "role", "address"],
         )
-        for run, (expires, _) in sorted(self._learners.items()):
-            family.add_metric([run, "learner", ""], (expires - now) / _DAY)
+        for run, (days, said) in sorted(self._learners.items()):
+            family.add_metric([run, "learner", ""], days - (now - said) / _DAY)
         for endpoint, listener in sorted(self._listeners.items()):
             family.add_metric(["", listener.common_name, endpoint], listener.validity.days_left())
         if (own := certificate_days_left(self._credentials)) is not None:
@@ -274,23 +326,24 @@ class CertificateDays:
 class StatusCollector:
     """Collector that queries the learners at each scrape. The timeout of the query bounds the time of a scrape."""
 
-    def __init__(self, certificates: CertificateDays | None = None) -> None:
-        """Construct the collector. `certificates`: those to report besides the learners'."""
-        self._certificates = certificates or CertificateDays([], None)
+    def __init__(self, certificates: CertificateDays | None = None, run: str = keys.ANY_RUN) -> None:
+        """Construct the collector of a run, or of all; `certificates` are those to report too."""
+        self._certificates, self._run = certificates or CertificateDays([], None), run
         self.transport: Transport | None = None  # None until a router answers
         self.unanswered = False  # whether no learner answered the last scrape
         self._warned = False  # that not all actors have series
 
     def collect(self) -> Iterator[Metric]:
         """Query the learners and return their metrics."""
-        statuses = []
+        found = Survey(statuses=[], unread={})
         if self.transport is not None:
-            with contextlib.suppress(TransportError, ProtocolError):
-                statuses = ask(self.transport, max_actors=_MAX_ACTORS)
-        self.unanswered = not statuses
-        self._warn_of_large_fleet(statuses)
-        yield from metrics(statuses)
-        yield self._certificates.metric(newest_of_each_run(statuses))
+            with contextlib.suppress(TransportError):
+                found = survey(self.transport, self._run, max_actors=_MAX_ACTORS)
+        self.unanswered = not found.statuses and not found.unread
+        found.log()
+        self._warn_of_large_fleet(found.statuses)
+        yield from metrics(found.statuses, found.unread)
+        yield self._certificates.metric(newest_of_each_run(found.statuses))
 
     def _warn_of_large_fleet(self, statuses: list[RunStatus]) -> None:
         """Warn once if not all actors have series of their own."""
@@ -315,7 +368,7 @@ def serve_metrics(
     """Serve the status of the learners at a host and port until `stop` is set, and return the exit status."""
     host, port = listener
     certificates = CertificateDays(endpoints, credentials)
-    collector, registry = StatusCollector(certificates), CollectorRegistry()
+    collector, registry = StatusCollector(certificates, run_for(credentials, keys.ANY_RUN)), CollectorRegistry()
     registry.register(collector)
     try:
         server = MetricsServer(host, port, registry)

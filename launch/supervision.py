@@ -256,12 +256,17 @@ def evaluators(
 
 
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:
-    """Start the gateway of a run under supervision, at an address of this machine, for whoever watches the run."""
+    """Start the gateway of a run under supervision, at an address of this machine, for whoever watches the run.
+
+    Ctrl-C does not reach it: it ends after the learner, so that its pages show the end of the run.
+    """
 
     def begin(_first: bool) -> Child:
         arguments = ["--connect", connect, "--or-any-port", *options]
         with open_streams(GATEWAY) as streams:
-            process = start("daedalus.cli.commands.gateway", *arguments, streams=streams, one_thread=True)
+            process = start(
+                "daedalus.cli.commands.gateway", *arguments, streams=streams, one_thread=True, own_session=True
+            )
         _yield_to_learner(process)
         return process
 

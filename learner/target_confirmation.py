@@ -191,7 +191,8 @@ class TargetConfirmation:
                 if failure := player.failure():
                     raise EvaluatorError(failure)
                 self._beat()
-                context.health.updated = time.monotonic()  # the learner works, although it does not train
+                health = context.health
+                health.updated = health.awaited_since = time.monotonic()  # it works, although it does not train
                 return not context.stop.is_set()
 
             reports = EvaluatorHost(context.name, player.transport).play(plan, [policy], goes_on)

@@ -154,17 +154,19 @@ class TrainingLoop:
         self._health.left_out = rollouts.left_out
         if not batch:
             return
+        began = time.monotonic()
         skipped = learner.updates_skipped
         left_out = self._learn_from(batch, progress)
         learner.anneal_exploration(self._context.spec.training.exploration_annealing(progress, env_steps))
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights, len(batch))
         rollouts.count_trained(batch, left_out, learner.far_outside)
+        now = time.monotonic()
         if learner.far_outside:
-            now = time.monotonic()
             self._health.note_far_outside(
                 {each.identity.actor: name for each, name in learner.far_outside.items()}, now
             )
-        self._health.updated = self._health.actor_seen = time.monotonic()
+        self._health.note_update(now)
+        self._counters.learning_seconds += now - began
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:
             _logger.warning(

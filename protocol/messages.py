@@ -5,6 +5,7 @@ messages, keys.py names the keys that they use, and the learner's intake decides
 """
 
 import hashlib
+import math
 import secrets
 from dataclasses import dataclass
 from typing import Literal
@@ -21,19 +22,31 @@ from daedalus.protocol.uploads import EPISODE_DTYPES, Gradient, Rollout
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientReport:
-    """Counts of one process of a client so far. Client -> learner, on `reports/{actor}`.
+    """What one process of an actor counts and measures. Actor -> learner, on `reports/{actor}`.
 
-    A client sends it every few seconds while the counts change. The answer is an Acknowledgement or a Refusal.
+    An actor sends it every few seconds while the counts change: a sign of life between two rollouts of a slow
+    environment. The answer is an Acknowledgement or a Refusal.
     """
 
     actor: str
     incarnation: int
+    rows: int = 0  # that it has begun so far; each is a step of all its environments
+    # Durations of the newest rollouts, in seconds; 0 before they are known.
+    rollout_seconds: float = 0.0  # to play one
+    waiting_seconds: float = 0.0  # from one to the next: for the learner, the network and newer snapshots
+    round_trip_seconds: float = 0.0  # until the answer to a small request of this actor
+    # Of a client, whose loop its user owns:
     deadlines: int = 0  # of its clock; 0 without a clock
     missed_deadlines: int = 0
     overridden_actions: int = 0  # of a person or a safety filter, played in place of the policy's
     safe_actions: int = 0  # played because the policy was too old or untrained
     rollouts_dropped: int = 0  # finished or not, that were never sent
     safe_reason: str = ""  # why it plays the safe action now; empty while the policy acts
+
+    def __post_init__(self) -> None:
+        for name in ("rollout_seconds", "waiting_seconds", "round_trip_seconds"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be 0 or more")
 
 
 Order = Literal["stop", "checkpoint", "drain"]
@@ -163,6 +176,12 @@ class ActorStatus(Specification):
     safe_actions: int = 0
     rollouts_dropped: int = 0
     safe_reason: str = ""
+    # What any actor reports of its newest process; 0 if it is unknown.
+    rows: int = 0
+    rollout_seconds: float = 0.0
+    waiting_seconds: float = 0.0
+    round_trip_seconds: float = 0.0
+    silence_limit_seconds: float = 60.0  # `seconds_since_seen` above it is unusual for this actor
     drained_by: str = ""  # who ordered it to leave; empty if nobody did
 
 
@@ -238,6 +257,9 @@ class RunStatus(Specification):
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
     updates_per_batch: int = 1  # by which a policy lag in updates is one in batches
+    bottleneck: str = ""  # what the run waits for, in one line for a person; empty if it is not known yet
+    learning_share: float = 0.0  # of the time in which the learner computes updates
+    decoding_share: float = 0.0  # of the time in which the learner decodes rollouts
     last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
 
     @property

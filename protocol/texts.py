@@ -126,6 +126,20 @@ def short_number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}"
 
 
+def short_rate(value: float) -> str:
+    """Return a rate that is seen to be above 0 however small it is: 12,345, 42, 0.48 or 0.0098."""
+    return f"{value:,.0f}" if value >= 9.95 else f"{value:.2g}"
+
+
+def short_duration(seconds: float) -> str:
+    """Return a duration with two digits that count, or more: 102 s, 1.5 s, 305 ms or 0.42 ms."""
+    if seconds >= 9.95:
+        return f"{seconds:,.0f} s"
+    if seconds >= 0.995:
+        return f"{seconds:.1f} s"
+    return f"{seconds * 1000:.0f} ms" if seconds >= 0.00995 else f"{seconds * 1000:.2g} ms"
+
+
 def policy_lag(updates: float, updates_per_batch: int) -> str:
     """Return a policy lag as `1 batch (160 updates)`, or as `0.8 updates` where a batch makes one update."""
     if updates_per_batch == 1:

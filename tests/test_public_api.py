@@ -456,6 +456,37 @@ def test_stacked_frames_are_cleared_by_reset(tmp_path: Path) -> None:
     assert [policy.act(observation) for observation in observations] == actions
 
 
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_batch_has_the_actions_of_single_calls_with_values_and_probabilities(tmp_path: Path, sampled: bool) -> None:
+    save(tmp_path, CARTPOLE, 1)
+    policy = daedalus.load_policy(tmp_path)
+    observations = np.random.default_rng(2).uniform(-0.5, 0.5, (64, 4)).astype(np.float32)
+    policy.reset(seed=3)
+    decisions = policy.act_batch(observations, sampled=sampled)
+    assert decisions.actions.shape == decisions.values.shape == decisions.log_probs.shape == (64,)
+    probabilities = decisions.probabilities["action"]
+    assert probabilities.shape == (64, 1, 2)
+    np.testing.assert_allclose(probabilities.sum(-1), 1.0, rtol=1e-5)
+    chosen = probabilities[np.arange(64), 0, decisions.actions]
+    np.testing.assert_allclose(np.exp(decisions.log_probs), chosen, rtol=1e-4)
+    np.testing.assert_allclose(
+        decisions.entropies, -(probabilities * np.log(probabilities)).sum((1, 2)), rtol=1e-3, atol=1e-5
+    )
+    assert len(set(decisions.values.tolist())) == 64
+    if not sampled:
+        assert decisions.actions.tolist() == [int(policy.act(observation)) for observation in observations]
+        assert decisions.actions.tolist() == probabilities[:, 0].argmax(-1).tolist()
+    alone = policy.act_batch(observations[5:6])
+    np.testing.assert_allclose(alone.values, decisions.values[5:6], rtol=1e-4)
+
+
+def test_a_batch_is_refused_for_a_policy_that_remembers(tmp_path: Path) -> None:
+    save(tmp_path, COUNTING, 1)
+    policy = daedalus.load_policy(tmp_path, allow_modules=["counting_environment"])
+    with pytest.raises(ValueError, match="remembers earlier observations"):
+        policy.act_batch([policy.observation_space.sample()])
+
+
 def test_sampled_actions_depend_on_the_seed(tmp_path: Path) -> None:
     save(tmp_path, CARTPOLE, 1)
     policy = daedalus.load_policy(tmp_path)

@@ -4,12 +4,12 @@ Everything that these rules do not allow is denied. Plain TCP connections have f
 loopback only (transport/addresses.py). So have connections over a Unix socket. Pure functions.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from daedalus.protocol import keys
 
-_RUN = "*"
+_BOTH = ("ingress", "egress")
 _EVERYTHING = (
     "put",
     "delete",
@@ -23,38 +23,49 @@ _EVERYTHING = (
 )
 
 
-def common_name(role: str, name: str = "") -> str:
-    """Return the common name of a certificate: `learner`, `router`, `actor:NAME` or `operator:NAME`."""
-    return f"{role}:{name}" if name else role
+def common_name(role: str, name: str = "", run: str = "") -> str:
+    """Return the common name of a certificate.
+
+    It is `router`, `learner`, `actor:NAME` or `operator:NAME`, with `@RUN` after the name if the certificate is for the
+    runs RUN and RUN.anything only. A learner for these runs only has no other name: `learner:RUN`.
+    """
+    if role == "learner":
+        return f"{role}:{run}" if run else role
+    return f"{role}:{name}{f'@{run}' if run else ''}" if name else role
 
 
-def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str, Any]:
+def parse_common_name(text: str) -> tuple[str, str, str]:
+    """Return the role, the name and the run in a common name; an empty text for what it does not have."""
+    role, _, name = text.partition(":")
+    if role == "learner":
+        return role, "", name
+    name, _, run = name.partition("@")
+    return role, name, run
+
+
+def access_control(clients: Iterable[str]) -> dict[str, Any]:
     """Return Zenoh's `access_control` setting for a router (or a learner, which embeds one).
 
     Args:
-      actors, operators: authorised names.
+      clients: authorised common names of actors, operators, and learners of certain runs.
     """
-    rules = [
-        _rule("all", ("ingress", "egress"), _EVERYTHING, ["daedalus/**"]),
-        *_actors_rules(),
-        *_operators_rules(),
-    ]
+    identities = sorted({(*parse_common_name(client), client) for client in clients})
+    rules = [_rule("all", _BOTH, _EVERYTHING, ["daedalus/**"])]
     subjects: list[dict[str, Any]] = [
         {"id": "learner and routers", "cert_common_names": [common_name("learner"), common_name("router")]},
         {"id": "this machine", "link_protocols": ["tcp", "unixsock-stream"]},
     ]
     policies: list[dict[str, Any]] = [{"rules": ["all"], "subjects": ["learner and routers", "this machine"]}]
-    shared = [rule["id"] for rule in _actors_rules()]
-    for operator in sorted(operators):
-        rules += _orders_rules(operator)
-        subjects.append({"id": f"operator {operator}", "cert_common_names": [common_name("operator", operator)]})
-        allowed = ["operators query", "operators receive", *(rule["id"] for rule in _orders_rules(operator))]
-        policies.append({"rules": allowed, "subjects": [f"operator {operator}"]})
-    for actor in sorted(actors):
-        rules += _own_rules(actor)
-        subjects.append({"id": f"actor {actor}", "cert_common_names": [common_name("actor", actor)]})
-        own = [f"{actor} joins and uploads", f"{actor} is present", f"{actor} receives replies"]
-        policies.append({"rules": [*shared, *own], "subjects": [f"actor {actor}"]})
+    shared: dict[tuple[str, str], list[dict[str, Any]]] = {}  # by role and run
+    for role, name, run, client in identities:
+        of_all, of_one = _RULES[role]
+        if (role, run) not in shared:
+            shared[role, run] = of_all(run)
+            rules += shared[role, run]
+        own = of_one(name, run)
+        rules += own
+        subjects.append({"id": client, "cert_common_names": [client]})
+        policies.append({"rules": [rule["id"] for rule in (*shared[role, run], *own)], "subjects": [client]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -62,6 +73,26 @@ def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str,
         "subjects": subjects,
         "policies": policies,
     }
+
+
+def _chunks(run: str) -> list[str]:
+    """Return the runs that a certificate is for, as chunks of keys: all, or `run` and those whose names begin so."""
+    return [run, f"{run}.$*"] if run else ["*"]
+
+
+def _suffix(run: str) -> str:
+    return f" of {run}" if run else ""
+
+
+def _learner_rules(run: str) -> list[dict[str, Any]]:
+    """Return the rules of a learner of certain runs: everything in these runs.
+
+    It also receives queries to all runs at once; Zenoh passes on what fits a queryable that it could declare.
+    """
+    return [
+        _rule(f"everything{_suffix(run)}", _BOTH, _EVERYTHING, [f"daedalus/{each}/**" for each in _chunks(run)]),
+        _rule(f"queries to all runs{_suffix(run)}", ["egress"], ["query"], ["daedalus/**"]),
+    ]
 
 
 def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressions: list[str]) -> dict[str, Any]:
@@ -74,73 +105,77 @@ def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressi
     }
 
 
-def _actors_rules() -> list[dict[str, Any]]:
-    """Return the rules of every actor: query programs and snapshots; subscribe; watch the learner."""
-    queried = [keys.program(_RUN, "*"), keys.snapshots(_RUN)]
-    published = [keys.snapshots(_RUN), keys.run_end(_RUN), keys.orders(keys.NO_RUN, "*")]
-    served = [*queried, *_own_keys("*")]
+def _actors_rules(run: str) -> list[dict[str, Any]]:
+    """Return the rules of every actor of some runs: query programs and snapshots; subscribe; watch the learner."""
+    queried = [key for each in _chunks(run) for key in (keys.program(each, "*"), keys.snapshots(each))]
+    published = [key for each in _chunks(run) for key in (keys.snapshots(each), keys.run_end(each))]
+    published += [] if run else [keys.orders(keys.NO_RUN, "*")]  # whoever drains waiting actors is of no run
+    served = [*queried, *_own_keys("*", run)]
+    learners = [keys.learner(each) for each in _chunks(run)]
+    watching = ["declare_liveliness_subscriber", "liveliness_query"]
+    suffix = _suffix(run)
     return [
-        _rule("actors query", ["ingress"], ["query"], queried),
-        _rule("actors receive replies", ["egress"], ["reply"], queried),
-        _rule("actors discover queryables", ["egress"], ["declare_queryable"], served),
-        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], published),
-        _rule("actors receive publications", ["egress"], ["put"], published),
-        _rule(
-            "actors watch the learner",
-            ["ingress"],
-            ["declare_liveliness_subscriber", "liveliness_query"],
-            [keys.learner(_RUN)],
-        ),
-        _rule("actors see the learner", ["egress"], ["liveliness_token"], [keys.learner(_RUN)]),
+        _rule(f"actors{suffix} query", ["ingress"], ["query"], queried),
+        _rule(f"actors{suffix} receive replies", ["egress"], ["reply"], queried),
+        _rule(f"actors{suffix} discover queryables", ["egress"], ["declare_queryable"], served),
+        _rule(f"actors{suffix} subscribe", ["ingress"], ["declare_subscriber"], published),
+        _rule(f"actors{suffix} receive publications", ["egress"], ["put"], published),
+        _rule(f"actors{suffix} watch the learner", ["ingress"], watching, learners),
+        _rule(f"actors{suffix} see the learner", ["egress"], ["liveliness_token"], learners),
     ]
 
 
-def _own_keys(name: str) -> list[str]:
+def _own_keys(name: str, run: str) -> list[str]:
     """Return the keys of the queries that only the actor or evaluator `name` may send."""
-    return [
-        keys.join(_RUN, name),
-        keys.rollouts(_RUN, name),
-        keys.reports(_RUN, name),
-        keys.evaluations(_RUN, name),
-    ]
+    kinds = (keys.join, keys.rollouts, keys.reports, keys.evaluations)
+    return [key(each, name) for each in _chunks(run) for key in kinds]
 
 
-def _own_rules(actor: str) -> list[dict[str, Any]]:
+def _own_rules(actor: str, run: str) -> list[dict[str, Any]]:
     """Return the rules of one actor for its own name and for `NAME.anything`: one certificate serves a whole host."""
     names = [actor, f"{actor}.$*"]
-    sent = [key for name in names for key in _own_keys(name)]
+    sent = [key for name in names for key in _own_keys(name, run)]
+    present = [keys.presence(each, name, "*") for each in _chunks(run) for name in names]
     return [
-        _rule(f"{actor} joins and uploads", ["ingress"], ["query"], sent),
-        _rule(f"{actor} receives replies", ["egress"], ["reply"], sent),
-        _rule(
-            f"{actor} is present", ["ingress"], ["liveliness_token"], [keys.presence(_RUN, name, "*") for name in names]
-        ),
+        _rule(f"{actor}{_suffix(run)} joins and uploads", ["ingress"], ["query"], sent),
+        _rule(f"{actor}{_suffix(run)} receives replies", ["egress"], ["reply"], sent),
+        _rule(f"{actor}{_suffix(run)} is present", ["ingress"], ["liveliness_token"], present),
     ]
 
 
-def _operators_rules() -> list[dict[str, Any]]:
-    """Return the rules of every operator: query the status, and watch the presence."""
-    present = [keys.presence(_RUN, "*", "*"), keys.learner(_RUN)]
-    queried = [keys.status(_RUN)]
+def _operators_rules(run: str) -> list[dict[str, Any]]:
+    """Return the rules of every operator of some runs: query the status, and watch the presence."""
+    present = [key for each in _chunks(run) for key in (keys.presence(each, "*", "*"), keys.learner(each))]
+    queried = [keys.status(each) for each in _chunks(run)]
     return [
         _rule(
-            "operators query",
+            f"operators{_suffix(run)} query",
             ["ingress"],
             ["query", "declare_liveliness_subscriber", "liveliness_query"],
             [*queried, *present],
         ),
         _rule(
-            "operators receive",
+            f"operators{_suffix(run)} receive",
             ["egress"],
             ["reply", "declare_queryable", "declare_subscriber", "liveliness_token"],
-            [*queried, *present, keys.orders(_RUN, "*")],
+            [*queried, *present, *(keys.orders(each, "*") for each in _chunks(run))],
         ),
     ]
 
 
-def _orders_rules(operator: str) -> list[dict[str, Any]]:
+def _orders_rules(operator: str, run: str) -> list[dict[str, Any]]:
     """Return the rules of one operator for orders, under its own name only: the name says who gave an order."""
-    return [
-        _rule(f"operator {operator} orders", ["ingress"], ["query"], [keys.orders(_RUN, operator)]),
-        _rule(f"operator {operator} drains waiting actors", ["ingress"], ["put"], [keys.orders(keys.NO_RUN, operator)]),
-    ]
+    rule, ordered = f"operator {operator}{_suffix(run)}", [keys.orders(each, operator) for each in _chunks(run)]
+    orders = [_rule(f"{rule} orders", ["ingress"], ["query"], ordered)]
+    if not run:  # actors that wait are of no run
+        waiting = [keys.orders(keys.NO_RUN, operator)]
+        orders.append(_rule(f"{rule} drains waiting actors", ["ingress"], ["put"], waiting))
+    return orders
+
+
+# By role: the rules of all of a run, and those of one of them.
+_RULES: dict[str, tuple[Callable[[str], list[dict[str, Any]]], Callable[[str, str], list[dict[str, Any]]]]] = {
+    "actor": (_actors_rules, _own_rules),
+    "operator": (_operators_rules, _orders_rules),
+    "learner": (_learner_rules, lambda _name, _run: []),
+}

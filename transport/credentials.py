@@ -3,10 +3,10 @@
     ca.pem  certificate.pem  key.pem      created by `daedalus certs`
     clients.pem                           for a router or learner: the certificates of those that may connect
 
-clients.pem holds ca.pem and one issuer for each authorised actor and operator. The issuer's common name is its
-identity, and the only certificate that it signs is that of this identity: without the issuer in clients.pem, the
-certificate is worth nothing. Zenoh reports only that a link failed, so this file checks certificates before they are
-used.
+clients.pem holds ca.pem and one issuer for each authorised actor, operator, and learner of certain runs. The issuer's
+common name is its identity, and the only certificate that it signs is that of this identity: without the issuer in
+clients.pem, the certificate is worth nothing. Zenoh reports only that a link failed, so this file checks certificates
+before they are used.
 """
 
 import contextlib
@@ -20,7 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daedalus.transport.access_control import access_control
+from daedalus.protocol import keys
+from daedalus.transport.access_control import access_control, parse_common_name
 from daedalus.transport.addresses import AddressError, check_connecting, check_listening
 from daedalus.transport.certificate_expiry import Validity, expiry_watch
 
@@ -46,6 +47,7 @@ class Credentials:
     directory: Path
     role: str  # learner, router, actor, operator
     name: str  # empty for a learner or router
+    run: str = ""  # if it is for the runs RUN and RUN.anything only
 
     def settings(self, *, listens: bool) -> dict[str, Any]:
         """Return Zenoh's settings for mutual TLS and, if the session listens, for access control.
@@ -63,7 +65,7 @@ class Credentials:
         }
         if listens:
             settings[f"{tls}/listen_certificate"], settings[f"{tls}/listen_private_key"] = certificate, key
-            settings["access_control"] = access_control(**authorised_names(self.directory))
+            settings["access_control"] = access_control(authorised_clients(self.directory))
         return settings
 
     def hosts(self) -> list[str]:
@@ -98,25 +100,43 @@ def load(directory: Path, *roles: str) -> Credentials:
     CA, or its role is not one of `roles`.
     """
     subject = common_name_of(_verified(directory))
-    role, _, name = subject.partition(":")
+    role, name, run = parse_common_name(subject)
     if role not in roles:
         raise CredentialsError(
             f"{directory} holds the certificate of {_described(role, name)}, but {' or '.join(roles)} is required: "
             f"issue one (daedalus certs issue {roles[0]})"
         )
     # It is read again later, when the code of a user may have changed the working directory.
-    return Credentials(Path(os.path.abspath(directory)), role, name)
+    return Credentials(Path(os.path.abspath(directory)), role, name, run)
 
 
-def authorised_names(directory: Path) -> dict[str, list[str]]:
-    """Return the `actors` and `operators` in clients.pem. Raises CredentialsError if it is not readable."""
+def authorised_clients(directory: Path) -> list[str]:
+    """Return the common names of the actors, operators and learners of certain runs in clients.pem.
+
+    Raises CredentialsError if it is not readable.
+    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(directory / CLIENTS)
     except (OSError, ssl.SSLError):
         raise CredentialsError(f"{directory} has no readable {CLIENTS}: create it with `daedalus certs`") from None
-    identities = [common_name_of(issuer).partition(":") for issuer in context.get_ca_certs()]
-    return {f"{role}s": sorted(name for kind, _, name in identities if kind == role) for role in ("actor", "operator")}
+    names = map(common_name_of, context.get_ca_certs())
+    return sorted(name for name in names if name.partition(":")[0] in ("actor", "operator", "learner"))
+
+
+def run_for(credentials: Credentials | None, run: str) -> str:
+    """Return the run to take part in or to watch: of a certificate that is for certain runs, it is one of these.
+
+    `run` is the user's choice, or `*`. Raises CredentialsError if the certificate is for other runs.
+    """
+    if credentials is None or not credentials.run or keys.owner(run) == credentials.run:
+        return run
+    if run == keys.ANY_RUN:
+        return credentials.run
+    raise CredentialsError(
+        f"the certificate in {credentials.directory} is not for the run {run!r}, only for {credentials.run!r} and "
+        f"{credentials.run}.ANYTHING: rename the run, or use another certificate (daedalus certs issue)"
+    )
 
 
 def common_name_of(certificate: dict[str, Any]) -> str:
@@ -269,7 +289,7 @@ class CredentialsWatch:
         folder = self._credentials.directory
         try:
             load(folder, self._credentials.role)
-            names = authorised_names(folder)
+            clients = authorised_clients(folder)
         except CredentialsError as error:
             _logger.warning("the changed certificates are not used: %s", error)
             return
@@ -277,8 +297,7 @@ class CredentialsWatch:
         _logger.info(
             "certificates in %s have changed: %d actors and %d operators are authorised; all connections are renewed",
             folder,
-            len(names["actors"]),
-            len(names["operators"]),
+            *(sum(client.startswith(f"{role}:") for client in clients) for role in ("actor", "operator")),
         )
 
     def _stamp(self) -> _Stamp:
@@ -298,7 +317,15 @@ SECURITY_ERRORS = (AddressError, CredentialsError)
 def credentials_to_listen(endpoints: list[str], tls: Path | None, role: str, *, insecure: bool) -> Credentials | None:
     """Return the certificate to listen with, or None without `tls`. Raises one of SECURITY_ERRORS."""
     check_listening(endpoints, tls=tls is not None, insecure=insecure)
-    return None if tls is None else load(tls, role)
+    if tls is None:
+        return None
+    credentials = load(tls, role)
+    if credentials.run:
+        raise CredentialsError(
+            f"{tls} holds the certificate of a learner for the run {credentials.run!r} only, which may not listen: "
+            "start a router (daedalus router), and use --connect"
+        )
+    return credentials
 
 
 def credentials_to_connect(endpoints: list[str], tls: str | Path | None, *roles: str) -> Credentials | None:

@@ -108,6 +108,10 @@ class Transport(QuerySender, Protocol):
         """Return all answers that arrive within `timeout` seconds; an empty list if no process serves the key."""
         ...
 
+    def query_by_key(self, key: str, payload: bytes = b"", *, timeout: float) -> list[tuple[str, bytes]]:
+        """Return what `query` does, each answer with the key that its server serves."""
+        ...
+
     def publish(self, key: str, payload: bytes) -> None:
         """Push a value to all subscribers of the key; a subscriber on a congested link may miss values."""
         ...

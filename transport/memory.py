@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 
 from daedalus.protocol import keys
 from daedalus.transport.interface import Declaration, Inbox, OnAnswer, Request
@@ -96,17 +97,21 @@ class MemoryTransport:
 
     def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
-        answers: list[bytes] = []
+        return [answer for _, answer in self.query_by_key(key, payload, timeout=timeout)]
+
+    def query_by_key(self, key: str, payload: bytes = b"", *, timeout: float) -> list[tuple[str, bytes]]:
+        """See Transport."""
+        answers: list[tuple[str, bytes]] = []
         answered = threading.Semaphore(0)
 
-        def on_answer(answer: bytes | None) -> None:
+        def on_answer(served: str, answer: bytes | None) -> None:
             if answer is not None:
-                answers.append(answer)
+                answers.append((served, answer))
             answered.release()
 
         handlers = self._handlers(key)
         for served, handler in handlers:
-            handler(_MemoryRequest(served, payload, on_answer))
+            handler(_MemoryRequest(served, payload, partial(on_answer, served)))
         deadline = time.monotonic() + timeout
         for _ in handlers:
             answered.acquire(timeout=max(deadline - time.monotonic(), 0.0))

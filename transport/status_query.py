@@ -3,22 +3,23 @@
 import logging
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeVar
 
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.codec import ProtocolError, UnfitMessageError, VersionMismatchError, decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, Limits
 from daedalus.protocol.messages import (
     ActorsReport,
     ActorsRequest,
-    ActorStatus,
     EventsPage,
     EventsReport,
     EventsRequest,
     RunStatus,
     StatusReport,
 )
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
@@ -27,22 +28,75 @@ _Kind = TypeVar("_Kind")
 
 _ANSWER_SECONDS = 5.0
 _PAGES_SECONDS = 3.0  # for all pages of a run
+_MAX_UNREAD = 32  # runs that are named
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Survey:
+    """The learners that answered, as far as this release can read them."""
+
+    statuses: list[RunStatus]
+    unread: dict[str, str]  # by run: why its learner's answer cannot be read, and what to do
+
+    @property
+    def left_out(self) -> list[str]:
+        """A line for a person about each run that cannot be read."""
+        return [f"run {run!r} is left out: {reason}" for run, reason in sorted(self.unread.items())]
+
+    def log(self) -> None:
+        """Log what is left out, each line once."""
+        for line in self.left_out:
+            _warn(line)
 
 
 def ask(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None = None) -> list[RunStatus]:
-    """Return the status of each learner that answers within 5 s. Raises TransportError or ProtocolError.
+    """Return the status of each learner that answers within 5 s, as `survey` does.
 
-    They are sorted by run. If several learners of one run answer, the newest is first, and each other one has the
-    problem that it is not the newest.
+    A learner that cannot be read is logged once, with its run and what to do, and left out. Raises TransportError, and
+    ProtocolError if none can be read.
+    """
+    found = survey(transport, run, max_actors=max_actors)
+    if found.unread and not found.statuses:
+        raise ProtocolError("; ".join(found.left_out))
+    found.log()
+    return found.statuses
+
+
+def survey(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None = None) -> Survey:
+    """Return the status of each learner that answers within 5 s, and what cannot be read. Raises TransportError.
+
+    The statuses are sorted by run. If several learners of one run answer, the newest is first, and each other one has
+    the problem that it is not the newest.
 
     Args:
       transport: the network.
       run: name of the run, or `*` for all runs.
       max_actors: the number of actors of each run after which no further page is fetched; None: all actors.
     """
-    answers = transport.query(keys.status(run), timeout=_ANSWER_SECONDS)
-    statuses = [report.status for report in decoded(answers, StatusReport)]
-    return [_with_actors(transport, status, max_actors) for status in _newest_first(statuses)]
+    statuses, unread = [], dict[str, str]()
+    for key, answer in transport.query_by_key(keys.status(run), timeout=_ANSWER_SECONDS):
+        try:
+            message = decode(answer, STATUS_LIMITS)
+            if not isinstance(message, StatusReport):
+                raise ProtocolError(f"{type(message).__name__} in place of a status")
+            statuses.append(message.status)
+        except ProtocolError as error:
+            if len(unread) < _MAX_UNREAD:
+                unread[bounded_text(key.split("/")[1], MAX_NAME)] = _remedy(bounded_text(key), error)
+    return Survey(
+        statuses=[_with_actors(transport, status, max_actors) for status in _newest_first(statuses)], unread=unread
+    )
+
+
+def _remedy(key: str, error: ProtocolError) -> str:
+    """Return why an answer with this key cannot be read, whose fault that is, and what to do."""
+    match error:
+        case VersionMismatchError():
+            return f"its learner is of another release; {error}"
+        case UnfitMessageError():
+            return f"its learner is of another release ({error}): ask with the release of daedalus-rl that it has"
+        case _:
+            return f"what answers for its learner is not one ({error}): find out which process serves {key}"
 
 
 def decoded(
@@ -95,21 +149,31 @@ def _newest_first(statuses: list[RunStatus]) -> list[RunStatus]:
 
 
 def no_answer(transport: Transport, run: str) -> str:
-    """Return the error message where no learner of a run answers, with the runs that do. Raises as `ask` does."""
-    statuses = [] if run == keys.ANY_RUN else newest_of_each_run(ask(transport, max_actors=0))
-    if statuses:
-        there = ", ".join(repr(status.run) for status in statuses)
+    """Return the error message where no learner of a run answers, with the runs that do. Raises TransportError."""
+    found = Survey(statuses=[], unread={}) if run == keys.ANY_RUN else survey(transport, max_actors=0)
+    runs = {status.run for status in found.statuses} | found.unread.keys()
+    if runs:
+        there = ", ".join(map(repr, sorted(runs)))
         return f"no learner of run {run!r} answers; the runs here are {there}"
     return "no learner answers at this address: is a learner running?"
 
 
 def ask_events(transport: Transport, status: RunStatus) -> EventsPage | None:
-    """Return the newest events of a run, or None if its learner does not answer. Raises as `ask` does."""
+    """Return the newest events of a run, or None if its learner gives none that can be read. Raises TransportError."""
     answers = transport.query(keys.status(status.run), encode(EventsRequest()), timeout=_ANSWER_SECONDS)
-    for report in decoded(answers, EventsReport):
+    for report in _of_run(status, answers, EventsReport):
         if report.page.learner_epoch == status.learner_epoch:
             return report.page
     return None
+
+
+def _of_run(status: RunStatus, answers: list[bytes], kind: type[_Kind]) -> list[_Kind]:
+    """Return the further messages about a run; what cannot be read is logged once, and hides no other run."""
+    try:
+        return decoded(answers, kind)
+    except ProtocolError as error:
+        _warn(f"run {status.run!r} is shown in part: {_remedy(keys.status(status.run), error)}")
+        return []
 
 
 def waiting_actors(transport: Transport) -> dict[str, list[int]]:
@@ -123,21 +187,17 @@ def waiting_actors(transport: Transport) -> dict[str, list[int]]:
 
 
 def _with_actors(transport: Transport, status: RunStatus, max_actors: int | None) -> RunStatus:
-    """Return the status with the actors of the further pages, as far as the learner answers in time."""
-    actors, deadline = list(status.actors), time.monotonic() + _PAGES_SECONDS
+    """Return the status with the actors of the further pages, as far as the learner answers in time. Each once."""
+    actors, deadline = {actor.actor: actor for actor in status.actors}, time.monotonic() + _PAGES_SECONDS
     wanted = status.fleet_size if max_actors is None else min(status.fleet_size, max_actors)
-    while actors and len(actors) < wanted and time.monotonic() < deadline:
-        more = _page(transport, status, actors[-1].actor)
-        if not more:
+    while actors and len(actors) < wanted and (left := deadline - time.monotonic()) > 0.0:
+        last = max(actors)
+        request = encode(ActorsRequest(after=last))
+        answers = transport.query(keys.status(status.run), request, timeout=left)
+        # None without an answer, or if another learner has replaced this one.
+        pages = [each.page for each in _of_run(status, answers, ActorsReport)]
+        more = [each.actors for each in pages if each.learner_epoch == status.learner_epoch][:1]
+        actors |= {actor.actor: actor for page in more for actor in page if actor.actor > last}
+        if max(actors) == last:
             break
-        actors += more
-    return status.model_copy(update={"actors": tuple(actors)})
-
-
-def _page(transport: Transport, status: RunStatus, after: str) -> tuple[ActorStatus, ...]:
-    """Return the actors whose names come next; none without an answer, or if another learner has replaced this one."""
-    request = encode(ActorsRequest(after=after))
-    for report in decoded(transport.query(keys.status(status.run), request, timeout=_ANSWER_SECONDS), ActorsReport):
-        if report.page.learner_epoch == status.learner_epoch:
-            return report.page.actors
-    return ()
+    return status.model_copy(update={"actors": tuple(actors.values())})

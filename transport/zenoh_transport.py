@@ -135,8 +135,8 @@ def _as_transport_error(action: str) -> Iterator[None]:
         raise TransportError(f"cannot {action}: {error_text(error)}") from None
 
 
-def _answers(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
-    """Return every answer to a query within `timeout` seconds."""
+def _answers(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
+    """Return every answer to a query within `timeout` seconds, with its key."""
     replies = session.get(
         key,
         payload=payload,
@@ -144,7 +144,7 @@ def _answers(session: zenoh.Session, key: str, payload: bytes, timeout: float) -
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,  # otherwise one answer for each key, not for each server
     )
-    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    return [(str(reply.ok.key_expr), reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
 
 class ZenohTransport:
@@ -195,6 +195,10 @@ class ZenohTransport:
             )
 
     def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+        """See Transport."""
+        return [answer for _, answer in self.query_by_key(key, payload, timeout=timeout)]
+
+    def query_by_key(self, key: str, payload: bytes = b"", *, timeout: float) -> list[tuple[str, bytes]]:
         """See Transport."""
         with _as_transport_error(f"query {key}"):
             return _answers(self._session, key, payload, timeout)

@@ -38,7 +38,7 @@ class ClientAgent:
         self._index, self._exchange, self._guard, self._check = index, exchange, guard, check
         self._rows: ClientRows | None = None
         self._loaded: LoadedPolicy | None = None  # that acts
-        self.overridden_actions = self.safe_actions = 0
+        self.actions = self.overridden_actions = self.safe_actions = 0
         self._precision: Precision | None = None  # of the first observations
         self._watched, self._warned = 0, set[str]()
 
@@ -73,6 +73,7 @@ class ClientAgent:
         rows = self._rows
         assert rows is not None  # a Client waits for the first policy
         rows.observe(observation, action_mask)
+        self.actions += 1
         self._warn_of_losses(observation)
         while True:
             if rows.is_between_rollouts:

@@ -114,6 +114,10 @@ class Evaluator:
             self._thread.run(self._session.report_failure(error), to_the_end=True)
             raise
 
+    def leave(self, by: float) -> None:
+        """End `run`, also in the middle of an evaluation, whose episodes are dropped. From any thread."""
+        self._thread.notify(self._session.leave, by)
+
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
         self._thread.call(self._session.end_waiting)

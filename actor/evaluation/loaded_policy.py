@@ -1,9 +1,10 @@
 """A trained policy for a loop of the caller's own: load it from a run, give it observations, take its actions."""
 
 import copy
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -15,12 +16,27 @@ from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.environments.vector_environments import Observed
 from daedalus.actor.evaluation.episodes import RunningEpisodes
 from daedalus.policy.acting.noise import draw_noise, neutral_noise
-from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.hub import pull
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.policy.saving.saved_policy import pretrained as pretrained_directory
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
+from daedalus.policy.user_modules import NO_MODULES, ModuleNotAllowedError, UserModules
+from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import RunSpec
+
+if TYPE_CHECKING:
+    from daedalus.policy.acting.value_estimator import ValueEstimator
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Decisions:
+    """What a policy chose for N observations, and what its network says of them."""
+
+    actions: Any  # the environment's own, as those of a vector environment: [N] of a Discrete, [N, D] of a Box
+    log_probs: np.ndarray  # [N] float32, of the actions, in nats
+    values: np.ndarray  # [N] float32, discounted returns in the scale of the rewards that the learner sees
+    entropies: np.ndarray  # [N] float32, of the distributions of the actions, in nats
+    probabilities: Mapping[str, np.ndarray]  # [N, D, A] by discrete action: of the A choices of its D variables
 
 
 class Policy:
@@ -30,7 +46,13 @@ class Policy:
     the environment's.
     """
 
-    def __init__(self, saved: SavedPolicy, observation_space: gymnasium.Space, action_space: gymnasium.Space) -> None:
+    def __init__(
+        self,
+        saved: SavedPolicy,
+        observation_space: gymnasium.Space,
+        action_space: gymnasium.Space,
+        modules: UserModules = NO_MODULES,
+    ) -> None:
         """Raises EnvironmentSetupError if the spaces are not those that the policy was trained on."""
         self.spec: RunSpec = saved.spec
         self.policy_version: int = saved.policy_version
@@ -44,6 +66,8 @@ class Policy:
             )
         self._runtime = OnnxRuntime(saved.program)
         self._runtime.load(saved.weights)
+        self._saved, self._modules = saved, modules
+        self._network: ValueEstimator | None = None  # made when it is needed
         self._random = np.random.default_rng()
         self._repeat = saved.spec.environment.action_repeat
         self._pools_frames = pools_frames(as_on_gymnasium(saved.spec.environment))
@@ -82,6 +106,55 @@ class Policy:
             self._repeats_left = self._repeat
         self._repeats_left -= 1
         return copy.deepcopy(self._action)
+
+    def act_batch(
+        self, observations: Sequence[Any] | np.ndarray, *, sampled: bool = False, action_masks: Any = None
+    ) -> Decisions:
+        """Choose actions for many observations that do not follow each other, with values and probabilities.
+
+        It needs torch, and leaves the episode of `act` as it is.
+
+        Args:
+          observations: N observations of the environment's own space.
+          sampled: sample, as for `act`.
+          action_masks: N masks, as for `act`.
+
+        Raises ValueError as `act` does, for a policy that remembers earlier observations (a memory, stacked or pooled
+        frames), for one of action values, which has no probabilities, and if the network cannot be built, such as for
+        a module of the user that is not allowed.
+        """
+        spaces, count = self._transforms.spaces, len(observations)
+        stacked = any(isinstance(each, ArraySpace) and each.frames > 1 for each in spaces.observations.values())
+        if self._runtime.state_size or stacked or self._pools_frames:
+            raise ValueError("this policy remembers earlier observations: call act() for one after the other")
+        if not count or (action_masks is not None and len(action_masks) != count):
+            raise ValueError("give at least one observation, and as many action_masks as observations, or none")
+        masks = [None] * count if action_masks is None else action_masks
+        for mask in masks:
+            self._check_mask(mask)
+        rows = [self._transforms.observe_one(*row) for row in zip(observations, masks, strict=True)]
+        frames = {name: np.concatenate([row.frames[name] for row in rows]) for name in rows[0].frames}
+        legal = {name: np.concatenate([row.masks[name] for row in rows]) for name in rows[0].masks}
+        running = RunningEpisodes(spaces, self._runtime, count)
+        running.observe(Observed(frames, legal))
+        outputs = self._estimator().outputs(running.observations, legal)
+        if outputs is None:
+            raise ValueError("this policy takes the best of its action values and has no probabilities: call act()")
+        size = self._runtime.noise_size
+        choice = running.act(draw_noise(size, count, self._random) if sampled else neutral_noise(size, count))
+        return Decisions(
+            actions=self._transforms.env_actions(choice.actions), log_probs=choice.log_probs, **outputs._asdict()
+        )
+
+    def _estimator(self) -> "ValueEstimator":
+        if self._network is None:
+            from daedalus.policy.acting.value_estimator import ValueEstimator  # torch, which `act` does not need
+
+            try:
+                self._network = ValueEstimator(self._saved, self._modules)
+            except PolicyError as error:
+                raise ValueError(str(error)) from None
+        return self._network
 
     def _pooled(self, frame: Any) -> Any:
         """Return the maximum of the newest two observations, as Atari games were observed in training."""
@@ -148,9 +221,9 @@ def load_policy(
     else:
         path = Path(directory) if directory is not None else pretrained_directory(pretrained or "")
     saved = find_policy(path, newest)
+    modules = UserModules(frozenset(allow_modules), f"the run of {from_hub or saved.directory}")
     if observation_space is None or action_space is None:
         spec = as_on_gymnasium(saved.spec.environment).model_copy(update={"processes": False})
-        modules = UserModules(frozenset(allow_modules), f"the run of {from_hub or saved.directory}")
         try:
             modules.check(spec.user_modules)
         except ModuleNotAllowedError as error:
@@ -159,4 +232,4 @@ def load_policy(
         environment = make_gymnasium(spec, 1, modules=modules)
         environment.close()
         observation_space, action_space = environment.observation_space, environment.action_space
-    return Policy(saved, observation_space, action_space)
+    return Policy(saved, observation_space, action_space, modules)

@@ -75,6 +75,10 @@ class ActorService:
         """End a wait for a rollout of the collector. From any thread."""
         self._thread.notify(self._note_rollout)
 
+    def leave(self, by: float) -> None:
+        """Finish and upload the present rollout, then end `run`; at the latest at a monotonic time. From any thread."""
+        self._thread.notify(self._session.leave, by)
+
     def _note_rollout(self) -> None:
         self._session.rollout_ready = True
 
@@ -101,8 +105,8 @@ class ActorService:
         return None
 
     def _on_row(self) -> None:
-        if self._session.is_fetch_due(time.monotonic()):
-            self._thread.call(self._session.fetch_next)
+        if self._session.begin_row(time.monotonic()):
+            self._thread.call(self._session.act_in_rollout)
         else:
             self._thread.call_after_events(self._session.check_over)
 

@@ -50,6 +50,7 @@ _STEP_DOWN_SECONDS = 5.0  # for the older of two learners of a run to notice the
 _REOPEN_SECONDS = 5.0  # without an answer for so long, the session may be dead: open another
 _SILENCE_SECONDS = 10.0  # without a message for so long, ask whether the learner is there
 
+LEAVES = "asked by a signal to leave"
 WAITING_ORDERS = keys.orders(keys.NO_RUN, "*")  # to actors that wait for a run
 
 Result = TypeVar("Result")
@@ -168,6 +169,7 @@ class Conversation:
         self._has_joined = False  # any learner
         self._left = False  # whether a learner of the run left since the last join: the one there may be another
         self._over: RunOverError | None = None
+        self.leave_by: float | None = None  # the time by which this process has to leave; None: it stays
         self._learner_stopped = False  # since `follow`
         self._actions: list[AtOnce] = []
         self._noted = ""  # the last warning of another release
@@ -213,6 +215,10 @@ class Conversation:
         elif message.learner_epoch == self.learner_epoch:
             self._learner_stopped = True
 
+    def leave(self, by: float) -> None:
+        """Leave once what is under way is finished, and at the latest at a time."""
+        self.leave_by = by
+
     # --------------------------------------------------------------------------------------------- at once
 
     def act(self, *actions: AtOnce) -> None:
@@ -227,10 +233,16 @@ class Conversation:
     # ------------------------------------------------------------------------------------- is there a reason to end
 
     def check_over(self) -> None:
-        """Raise RunOverError if the run finished."""
+        """Raise RunOverError if the run finished, or if this process was asked to leave and has nothing to finish."""
         over, self._over = self._over, None
         if over is not None:
             raise over
+        if self.leave_by is not None:
+            self.check_leave(self.leave_by)
+
+    def check_leave(self, by: float) -> None:
+        """Raise RunOverError if there is nothing to finish before this process leaves, or no time."""
+        raise RunOverError(LEAVES)
 
     def check(self) -> None:
         """Raise if there is a reason to leave the learner: as `check_over` does, or LearnerLostError."""

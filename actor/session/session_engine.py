@@ -11,9 +11,9 @@ from typing import Never
 
 from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.actor_config import ActorConfig
-from daedalus.actor.session.conversation import Conversation, Steps, Wait, WatchPresence
+from daedalus.actor.session.conversation import LEAVES, Conversation, RunOverError, Steps, Wait, WatchPresence
 from daedalus.actor.session.snapshots import FetchSchedule, SnapshotFeed
-from daedalus.actor.session.uploading import Reports, Uploads
+from daedalus.actor.session.uploading import ACTOR_PAUSE_SECONDS, CLIENT_PAUSE_SECONDS, Pace, Reports, Uploads
 from daedalus.protocol import keys
 from daedalus.protocol.messages import UNKNOWN, ClientReport, Origin, Snapshot, Welcome
 from daedalus.protocol.spaces import Spaces
@@ -29,6 +29,7 @@ _SLOW_SECONDS, _SLOW_ROLLOUTS = 0.25, 3  # the first rollout of an environment m
 _SLOW_LINK_WINDOW = 4  # most rollouts in flight on a slow link, unless the run asks for more
 _CONFIRMATIONS = 4  # requests for a newer snapshot within the largest age of the policy
 _REFRESH_SECONDS = 0.2  # while a client fills a rollout, and between requests for a confirmation
+_UPLOAD_SECONDS = 5.0  # of the time to leave, for the last rollout to reach the learner
 _MANY_REJECTIONS = 20  # warn after this many consecutive rejections
 
 
@@ -61,7 +62,7 @@ class Load:
 class Collect:
     """Send back the next rollout, or None if a client has not filled it.
 
-    Before each row, call `ActorSession.check_over`, and `fetch_next` if `is_fetch_due`.
+    Before each row, call `ActorSession.begin_row`, and then `act_in_rollout` if it returns True, else `check_over`.
     """
 
     identity: RolloutIdentity
@@ -163,6 +164,7 @@ class ActorSession(PolicySession):
     Attributes:
       rollout_ready: set this when a client has filled a rollout.
       sequence: number of the next rollout in this learner epoch.
+      rows: rows of the present rollout that have begun. Whoever performs `Collect` counts them.
     """
 
     def __init__(
@@ -170,11 +172,17 @@ class ActorSession(PolicySession):
     ) -> None:
         """`report` returns what a client counts about itself; None: this actor is no client."""
         super().__init__(config, origin)
+        nothing = ClientReport(actor=config.name, incarnation=config.incarnation)
+        self._counts = report or (lambda: nothing)
         self.uploads = Uploads(config.name, self.heard)
         self.rollout_ready = False
         self.sequence = 0
+        self._plays = self._is_collecting = False
         self._schedule = FetchSchedule()
-        self._reports = None if report is None else Reports(report)
+        self._pace, self._is_filling = Pace(), False  # whether a client fills a rollout
+        pause = ACTOR_PAUSE_SECONDS if report is None else CLIENT_PAUSE_SECONDS
+        self._reports = Reports(lambda: self._pace.added_to(self._counts(), self.now), pause)
+        self._is_fetch_due = False  # in the rollout that is being played
         self._played_epoch = -1  # of the learner that has the rollouts in flight
         self._loaded_version = -1  # the policy version that the actor plays
         self._confirm_at = 0.0  # not before this time, a confirmation of the policy is requested
@@ -193,6 +201,7 @@ class ActorSession(PolicySession):
                 yield from self._play_with(welcome)
             except LearnerLostError as error:
                 _logger.info("%s", error)
+                self._plays = self._is_collecting = False
 
     # ------------------------------------------------------------------------------- what ends a session, and waits
 
@@ -204,6 +213,19 @@ class ActorSession(PolicySession):
         super().check_over()
         self.uploads.check_over()
 
+    def check_leave(self, by: float) -> None:
+        """See Conversation. The present rollout is finished and its verdict awaited, if there is time for both."""
+        unjudged, lost = len(self.uploads.in_flight.rollouts), list[str]()
+        if self._is_collecting:
+            if self.now < by - _UPLOAD_SECONDS:
+                return
+            lost.append(f"the rollout under way is lost ({self._pace.rows_played:,} rows in each environment)")
+        elif self._plays and unjudged and self.now < by:
+            return
+        if unjudged:
+            lost.append(f"{unjudged:,} uploaded rollouts had no verdict yet, and may be lost")
+        raise RunOverError(f"{LEAVES}: {'; '.join(lost) or 'no rollout is lost'}")
+
     def check(self) -> None:
         """Raise if there is a reason to stop collecting: see Conversation, and Uploads."""
         super().check()
@@ -213,8 +235,8 @@ class ActorSession(PolicySession):
         """Send what is due, and keep the policy from growing too old: its learner may be busy for long."""
         self.act(*self.uploads.take_due(self.now))
         yield from super().between()
-        if self._reports is not None:
-            self.act(*self._reports.take_due(self.run, self.now))
+        # An actor that waits for the learner is well. A client is if its loop makes rows.
+        self.act(*self._reports.take_due(self.run, self.now, repeats=not self._is_filling))
         confirm_at = self._confirmation_due()
         if confirm_at is None:
             return
@@ -226,8 +248,8 @@ class ActorSession(PolicySession):
 
     def due_times(self) -> list[float | None]:
         """See PolicySession."""
-        report_at = None if self._reports is None else self._reports.next_at
-        return [*super().due_times(), self.uploads.in_flight.next_due(), report_at, self._confirmation_due()]
+        in_flight_at = self.uploads.in_flight.next_due()
+        return [*super().due_times(), self.leave_by, in_flight_at, self._reports.next_at, self._confirmation_due()]
 
     def _confirmation_due(self) -> float | None:
         """Return when to ask whether the policy is the newest; None if its age does not matter."""
@@ -243,10 +265,11 @@ class ActorSession(PolicySession):
         spaces, count = yield Prepare(welcome)
         self.feed.begin()
         self.act(WatchPresence(keys.learner(welcome.run)))
-        if self._reports is not None:
-            self._reports.begin()
+        self._reports.begin()
         welcome = yield from self.confirm(welcome, replace(self.join, spaces=spaces, environments=count))
         spec = welcome.spec
+        self._pace.join(spec.collection.rollout_length)
+        self._is_filling = False
         if welcome.learner_epoch == self._played_epoch:  # the network failed, not the learner
             self.uploads.resume()
         else:
@@ -267,6 +290,7 @@ class ActorSession(PolicySession):
         """Collect and upload until something raises: the session's end, or an error."""
         synchronous, window = spec.algorithm.synchronous, spec.collection.window
         yield from self._await_newer(-1)
+        self._plays = True
         if not synchronous:
             self.feed.use_fetches()
         while True:
@@ -274,11 +298,18 @@ class ActorSession(PolicySession):
             # Before collecting, so that the rollout is of the newest policy.
             yield from self.wait(lambda: self.uploads.in_flight.has_room)
             self._warn_of_rejections()
+            if self.leave_by is not None:
+                yield from self.wait(lambda: False)  # until `check_leave` raises
             if not synchronous:
                 yield from self._await_fetch(self.now - began_waiting)
             yield self._load()
             began = self.now
-            payload = yield Encode((yield from self._collect()))
+            self._pace.begin_rollout(self.now)
+            self._is_collecting = True
+            rollout = yield from self._collect()
+            self._is_collecting = False
+            payload = yield Encode(rollout)
+            self._pace.end_rollout(self.now)
             if self.config.link == "auto" and self._slow_rollouts >= _SLOW_ROLLOUTS:
                 self.feed.use_differences()  # they cost the learner little
             if self.feed.is_slow:
@@ -338,29 +369,38 @@ class ActorSession(PolicySession):
             learner_epoch=self.learner_epoch,
         )
         self._schedule.begin_rollout(self.now, self.feed.fetch_seconds)
-        self.rollout_ready = False
+        self.rollout_ready, self._is_filling = False, True
         while (rollout := (yield Collect(identity))) is None:
             if not (yield from self.wait(lambda: self.rollout_ready, _REFRESH_SECONDS)):
-                if self.is_fetch_due(self.now):
-                    self.fetch_next()
+                if self._schedule.is_due(self.now):
+                    self._fetch_next()
                 self.check()
                 yield from self._read()
                 yield self._load()
             self.rollout_ready = False
+        self._is_filling = False
         self._schedule.end_rollout(self.now)
         self._slow_rollouts = self._slow_rollouts + 1 if self._schedule.rollout_seconds > _SLOW_SECONDS else 0
         return rollout
 
-    def is_fetch_due(self, now: float) -> bool:
-        """Return whether this rollout is about to end, so that `fetch_next` is due. Call this before each row.
+    def begin_row(self, now: float) -> bool:
+        """Note that a row begins; return whether `act_in_rollout` is due.
 
         No event changes what this method reads: it is no step.
         """
-        return self._schedule.is_due(now)
+        self._pace.begin_row(now)
+        self._is_fetch_due = self._schedule.is_due(now)
+        return self._is_fetch_due or self.leave_by is not None or now >= self._reports.next_at
 
-    def fetch_next(self) -> None:
-        """Request the snapshot of the next rollout, if that can begin at once. Raises as `check_over` does."""
+    def act_in_rollout(self) -> None:
+        """Request the snapshot of the next rollout if it is due, and report. Raises as `check_over` does."""
         self.check_over()
+        if self._is_fetch_due:
+            self._fetch_next()
+        self.act(*self._reports.take_due(self.run, self.now))
+
+    def _fetch_next(self) -> None:
+        """Request the snapshot of the next rollout, if that can begin at once."""
         if self.uploads.in_flight.has_room_for(2):
             self.feed.fetch()
 

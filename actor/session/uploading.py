@@ -2,9 +2,9 @@
 
 import contextlib
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
 
@@ -23,7 +23,9 @@ from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.protocol.uploads import Rollout, Upload
 
 _ACKNOWLEDGEMENT_SECONDS = 30.0  # a saturated learner answers late
-_REPORT_PAUSE_SECONDS, _REPORT_ANSWER_SECONDS = 2.0, 5.0  # between two reports, and for the answer to one
+# Between two reports: of a client, whose counts a person watches, and of another actor. And for the answer to one.
+CLIENT_PAUSE_SECONDS, ACTOR_PAUSE_SECONDS, _REPORT_ANSWER_SECONDS = 2.0, 5.0, 5.0
+_SMOOTHED_ROLLOUTS, _ROUND_TRIPS = 4, 4  # newest ones that the durations in a report are of
 _BUSY_SECONDS = 0.005  # before the first retry after `busy`; doubles with each
 _LOST_SECONDS = 0.1  # before the first retry without any answer; doubles with each
 _MAX_RETRY_SECONDS = 0.5
@@ -185,33 +187,103 @@ class Uploads:
         in_flight.acknowledge(sequence, answer if isinstance(answer, Acknowledgement) else None, now)
 
 
-class Reports:
-    """What a client counts about itself, for the status: reports to one learner after the other."""
+class Pace:
+    """How an actor spends its time: rows, and durations of the newest rollouts. All times are in seconds."""
 
-    def __init__(self, report: Callable[[], ClientReport]) -> None:
-        """`report` returns the counts so far."""
-        self._report = report
+    def __init__(self) -> None:
+        self.rows = 0  # that have begun
+        self._rollout_length = 0  # T
+        self._began, self._begun_rows = 0.0, 0  # of the newest rollout
+        self._row_at = 0.0  # of the newest row
+        self._ended: float | None = None  # when the newest rollout was complete; None before, or in a rollout
+        self._played = self._waited = 0.0  # in the rollouts since the last measurement
+        self._rollouts = 0
+        self._rollout_seconds = self._waiting_seconds = 0.0  # means over the newest rollouts
+
+    def join(self, rollout_length: int) -> None:
+        """Begin with a learner; the wait for it does not count."""
+        self._rollout_length, self._ended = rollout_length, None
+
+    def begin_rollout(self, now: float) -> None:
+        """Note that a rollout begins."""
+        if self._ended is not None:
+            self._waited += now - self._ended
+        self._began, self._begun_rows, self._ended = now, self.rows, None
+
+    def begin_row(self, now: float) -> None:
+        """Note that a row begins."""
+        self.rows += 1
+        self._row_at = now
+
+    def end_rollout(self, now: float) -> None:
+        """Note that a rollout is complete and encoded."""
+        self._played += now - self._began
+        self._rollouts += 1
+        self._ended = now
+
+    def added_to(self, report: ClientReport, now: float) -> ClientReport:
+        """Return a report with the rows and durations until now. A client counts its rows itself."""
+        if report.rows > self.rows:
+            self.rows, self._row_at = report.rows, now
+        if self._rollouts:
+            weight = min(self._rollouts / _SMOOTHED_ROLLOUTS, 1.0) if self._rollout_seconds else 1.0
+            self._rollout_seconds += weight * (self._played / self._rollouts - self._rollout_seconds)
+            self._waiting_seconds += weight * (self._waited / self._rollouts - self._waiting_seconds)
+            self._played, self._waited, self._rollouts = 0.0, 0.0, 0
+        waits = 0.0 if self._ended is None else now - self._ended
+        return replace(
+            report,
+            rows=self.rows,
+            rollout_seconds=self._rollout_seconds or self._expected,
+            waiting_seconds=max(self._waiting_seconds, waits),
+        )
+
+    @property
+    def rows_played(self) -> int:
+        """Rows of the newest rollout that are complete."""
+        return max(self.rows - self._begun_rows - 1, 0)
+
+    @property
+    def _expected(self) -> float:
+        """How long the first rollout will take, by its rows so far; 0 before two of them."""
+        rows = self.rows_played
+        return (self._row_at - self._began) / rows * self._rollout_length if rows > 0 else 0.0
+
+
+class Reports:
+    """What an actor reports about itself, for the status: reports to one learner after the other."""
+
+    def __init__(self, report: Callable[[], ClientReport], pause: float = CLIENT_PAUSE_SECONDS) -> None:
+        """`report` returns the counts so far; `pause` is the time between two reports, in seconds."""
+        self._report, self._pause = report, pause
         self._sent: ClientReport | None = None
+        self._round_trips: deque[float] = deque(maxlen=_ROUND_TRIPS)
         self.next_at = 0.0
 
     def begin(self) -> None:
         """Begin with another learner, which knows no counts."""
         self._sent, self.next_at = None, 0.0
+        self._round_trips.clear()
 
-    def take_due(self, run: str, now: float) -> list[Query]:
-        """Return a report of the counts, if they have changed since the last report, and that was a while ago."""
+    def take_due(self, run: str, now: float, *, repeats: bool = False) -> list[Query]:
+        """Return a report, if the last one was a while ago and the counts have changed; `repeats`: if not, too."""
         if now < self.next_at:
             return []
-        self.next_at = now + _REPORT_PAUSE_SECONDS
+        self.next_at = now + self._pause
         report = self._report()
-        if report == self._sent:
+        if report == self._sent and not repeats:
             return []
         self._sent = report
-        return [Query(keys.reports(run, report.actor), encode(report), _REPORT_ANSWER_SECONDS, self._on_answer)]
+        # The shortest: the learner's process may be busy for a moment.
+        timed = replace(report, round_trip_seconds=min(self._round_trips, default=0.0))
+        on_answer = partial(self._on_answer, now)
+        return [Query(keys.reports(run, report.actor), encode(timed), _REPORT_ANSWER_SECONDS, on_answer)]
 
-    def _on_answer(self, data: bytes | None, _now: float) -> None:
+    def _on_answer(self, asked_at: float, data: bytes | None, now: float) -> None:
         if data is None:
             self._sent = None  # a report that is lost is sent again later
+        else:
+            self._round_trips.append(now - asked_at)
 
 
 class UploadMaker(Protocol):

@@ -9,7 +9,7 @@ import argparse
 import sys
 import time
 
-from benchmarks.chaos import actors, clocks, disk, endings, learners, network, orders, wire
+from benchmarks.chaos import actors, clocks, disk, endings, learners, network, orders, slow, wire
 from benchmarks.chaos.scene import FailedError, say
 from benchmarks.running import machine, table
 
@@ -42,6 +42,7 @@ def main() -> int:
         "overload": lambda: wire.overload(max(60.0 * arguments.scale, 10.0)),
         "subscriber": lambda: wire.slow_subscriber(max(20.0 * arguments.scale, 5.0)),
         "clocks": lambda: clocks.steps(max(10.0 * arguments.scale, 3.0)),
+        "slow": lambda: slow.slow(max(600.0 * arguments.scale, 150.0)),
         "fuzz": lambda: wire.fuzz(scaled(1_000_000)),
         "solve": lambda: actors.solve(scaled(3)),
     }

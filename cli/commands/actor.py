@@ -13,7 +13,7 @@ from daedalus.cli.arguments import (
     log_options,
     seconds,
 )
-from daedalus.launch.actor_process import ActorOptions, run_actor
+from daedalus.launch.actor_process import ActorOptions, LeaveRequest, run_actor
 from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
@@ -34,6 +34,10 @@ examples:
   daedalus actor --connect tcp/gpu-box:7447 --allow-module corridor      (the run plays corridor:Corridor-v0)
   daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
   daedalus actor --connect tcp/router:7447 --stay      (serves one run after another)
+
+signals: SIGTERM and SIGINT end an actor after the current step; its unfinished rollout is lost. SIGUSR1 is for a host
+that is about to end: the actor finishes its rollout, uploads it, and ends within 30 s with exit status 0. A rollout
+that takes longer is dropped, and the log says how much is lost.
 
 exit status: 0 the run is over, the actor was stopped or an operator drained it; 1 failed; 2 bad usage. With --stay an
 actor ends by a signal, a drain, wrong arguments or its --timeout; after any other failure it tries again"""
@@ -129,10 +133,11 @@ def main() -> int:
     arguments = parser().parse_args()
     context: dict[str, str] = {}
     log_options(arguments).configure(process="actor", context=context)
-    stop = stop_on_signals(exit_if_stuck=True)
+    leave = LeaveRequest()
+    stop = stop_on_signals(exit_if_stuck=True, on_leave=leave.ask)
     if arguments.exit_with_parent:
         exit_with_parent(stop)
-    return run_actor(actor_options(arguments), stop, context)
+    return run_actor(actor_options(arguments), stop, context, leave)
 
 
 def run_process() -> NoReturn:

@@ -36,6 +36,11 @@ examples:
   daedalus certs issue gateway --host play.example
   daedalus certs issue client phone-1     (a token for a client of the gateway)
 
+One CA is one trust domain: the certificates above are for all runs of a router. To keep its users apart:
+  daedalus certs issue learner alice              serves the runs alice and alice.ANYTHING only, over a router
+  daedalus certs issue actor arm-3 --run alice    joins, and
+  daedalus certs issue operator ann --run alice   reads and orders these runs only
+
 The certificate of an actor allows it to play under its name NAME or NAME.ANYTHING. The certificate of an operator
 allows `daedalus status` and `daedalus exporter`; the token beside it is for the buttons on the page of a gateway.
 Learners and routers notice within seconds that a file in their folder has changed: after `issue` and `revoke`, copy
@@ -55,15 +60,27 @@ def parser() -> argparse.ArgumentParser:
     _add_host(init)
     issue = verbs.add_parser("issue", help="create certificates or tokens, or new ones in their place")
     issue.add_argument("role", choices=(*_NAMED, *_LISTENERS), help="kind of process that uses the certificate")
-    issue.add_argument("names", nargs="*", metavar="NAME", help="name of an actor, operator or client")
+    issue.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="name of an actor, operator or client; of a learner, the run that its certificate is only for",
+    )
     _add_host(issue)
+    issue.add_argument(
+        "--run",
+        default="",
+        metavar="RUN",
+        help="the certificates of these actors or operators are only for the runs RUN and RUN.ANYTHING (default: for "
+        "all runs; an existing one stays as it is)",
+    )
     renew = verbs.add_parser("renew", help="create new certificates and tokens in place of those that expire soon")
     renew.add_argument(
         "role", nargs="?", choices=(*_NAMED, *_LISTENERS), help="kind of process whose certificate is renewed now"
     )
     renew.add_argument("names", nargs="*", metavar="NAME", help="name of an actor, operator or client (default: all)")
     revoke = verbs.add_parser("revoke", help="withdraw the authorisation of actors, operators and clients")
-    revoke.add_argument("role", choices=_NAMED, help="kind of process that used the certificate")
+    revoke.add_argument("role", choices=(*_NAMED, "learner"), help="kind of process that used the certificate")
     revoke.add_argument("names", nargs="+", metavar="NAME", help="name of an actor, operator or client")
     listed = verbs.add_parser("list", help="show all certificates and when they expire")
     for verb in (init, issue, renew):
@@ -147,9 +164,13 @@ def _issue(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]
 
 
 def _issue_operators(folder: "CertificateFolder", identities: "list[Identity]", days: int) -> None:
-    """Issue the tokens of the operators among the identities, for the page of a gateway."""
+    """Issue the tokens of the operators among the identities, for the page of a gateway.
+
+    An operator of certain runs has none: a gateway cannot tell for which run it is.
+    """
     tokens = ClientTokens(folder.directory)
-    operators = {identity.name: identity.folder for identity in identities if identity.role == "operator"}
+    known = {identity: identity for identity in folder.identities()}
+    operators = {each.name: each.folder for each in identities if each.role == "operator" and not known[each].run}
     if operators:
         tokens.issue_operators(operators, days)
     tokens.copy_to_gateway()
@@ -225,16 +246,21 @@ def _state(days: float) -> str:
 def _named(parsed: argparse.Namespace) -> "list[Identity]":
     from daedalus.launch.certificates import Identity
 
-    if (parsed.role in _NAMED) != bool(parsed.names):
-        raise CredentialsError("wrong number of names: name actors, operators and clients, and nobody else")
-    return [Identity(parsed.role, name) for name in parsed.names or [""]]
+    run = vars(parsed).get("run", "")
+    if parsed.role != "learner" and (parsed.role in _NAMED) != bool(parsed.names):
+        raise CredentialsError("wrong number of names: name actors, operators, clients and learners, and nobody else")
+    if run and parsed.role not in ("actor", "operator"):
+        raise CredentialsError(
+            "--run is for actors and operators; a learner has its run as its name: issue learner RUN"
+        )
+    return [Identity(parsed.role, name, run) for name in parsed.names or [""]]
 
 
 def _issued(folder: "CertificateFolder", identities: "list[Identity]") -> list[str]:
     lines = []
     for identity in identities:
         path = folder.directory / identity.folder
-        if identity.role in _NAMED:
+        if not identity.listens:
             lines.append(f"{path}    copy this folder to the host of the {identity.role}, for its option --tls")
         else:
             lines.append(f"{path}    valid for {', '.join(folder.hosts(identity))}")

@@ -119,10 +119,11 @@ def _add_page(options: argparse.ArgumentParser) -> None:
     )
     options.add_argument("--no-camera", action="store_true", help="play no episodes for the page")
     options.add_argument(
-        "--checkpoints",
+        "--run-dir",
         type=Path,
         metavar="RUN_DIR",
-        help="directory of the run, on this machine: its newest checkpoint estimates values for the camera, with torch",
+        help="directory of the run, on this machine: the page shows its settings, how it ended and, to holders of a "
+        "token, what its actors printed; its newest checkpoint estimates values for the camera, with torch",
     )
 
 
@@ -148,7 +149,7 @@ def gateway_options(arguments: argparse.Namespace) -> GatewayOptions:
         insecure=arguments.insecure,
         compare=arguments.compare,
         camera=not arguments.no_camera,
-        checkpoints=arguments.checkpoints,
+        run_directory=arguments.run_dir,
         allowed_modules=arguments.allow_module,
         takes_clients=not arguments.page_only,
         for_a_person=arguments.exit_with_parent,

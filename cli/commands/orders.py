@@ -11,7 +11,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import RunStatus
 from daedalus.transport.connecting import connect_once
-from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_connect
+from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_connect, run_for
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.operator_orders import Operator, OrderError
 from daedalus.transport.status_query import ask, newest_of_each_run, no_answer, waiting_actors
@@ -138,6 +138,7 @@ def _give(
         for name in names:
             keys.check_name(name, "name")
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
+        parsed.run = run_for(credentials, parsed.run)
     except (ValueError, *SECURITY_ERRORS) as error:
         print_error(command, error)
         return status_at_start(error)

@@ -3,13 +3,13 @@
 import argparse
 from pathlib import Path
 
-from daedalus.analysis.charts import INSTALL
 from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS, read_record
 from daedalus.analysis.run_groups import select
 from daedalus.analysis.run_report import comparison_page, run_page
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
 from daedalus.launch.logs import print_error, say
+from daedalus.learner.run.run_directory import REPORT
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.regular_files import replace_text
 
@@ -30,8 +30,6 @@ A video for the report: daedalus evaluate RUN_DIR --video RUN_DIR/replay.mp4
 
 exit status: 0 done, 1 failed, 2 bad usage"""
 
-_NAME = "report.html"
-
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus report`."""
@@ -44,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
         "--output",
         type=Path,
         metavar="FILE",
-        help=f"file to write (default: {_NAME} in the directory of the run, or here for several runs)",
+        help=f"file to write (default: {REPORT} in the directory of the run, or here for several runs)",
     )
     options.add_argument(
         "--by", choices=(ENV_STEPS, "minutes"), default=ENV_STEPS, help="horizontal axis (default: %(default)s)"
@@ -58,6 +56,13 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
+def write_report(directory: Path) -> Path:
+    """Write the report of one run into its directory, and return the path. Raises RunDataError or OSError."""
+    ((group,), *_), _ = select([[directory]], finished=False, columns=[SECONDS], read=read_record)
+    replace_text(directory / REPORT, run_page(group, ENV_STEPS))
+    return directory / REPORT
+
+
 def report(arguments: list[str]) -> int:
     """Run `daedalus report` and return its exit status: 0 done, 1 failed."""
     parsed, parts = parse_groups(parser(), arguments)
@@ -67,15 +72,12 @@ def report(arguments: list[str]) -> int:
             print_error("report", problem)
         groups = [group for groups in environments for group in groups]
         if len(groups) == 1 and len(groups[0].runs) == 1 and not problems:
-            page, output = run_page(groups[0], parsed.by), parsed.output or groups[0].runs[0].directory / _NAME
+            page, output = run_page(groups[0], parsed.by), parsed.output or groups[0].runs[0].directory / REPORT
         else:
             page = comparison_page(environments, parsed.by, threshold=parsed.threshold, left_out=problems)
-            output = parsed.output or Path(_NAME)
+            output = parsed.output or Path(REPORT)
     except RunDataError as error:
         print_error("report", error)
-        return 1
-    except ModuleNotFoundError:
-        print_error("report", INSTALL)
         return 1
     try:
         replace_text(output, page)

@@ -20,12 +20,12 @@ from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
-from daedalus.protocol.texts import one_line, policy_lag, printable, short_number
+from daedalus.protocol.texts import one_line, policy_lag, printable, short_duration, short_number, short_rate
 from daedalus.transport.certificate_expiry import WARNING_DAYS
 from daedalus.transport.connecting import connect_once
-from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect
+from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect, run_for
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.status_query import ask, ask_events, no_answer, waiting_actors
+from daedalus.transport.status_query import ask_events, no_answer, survey, waiting_actors
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
 _MOST_WAITING = 20  # names of actors that wait for a run
@@ -46,9 +46,10 @@ examples:
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
-lag is how old the policy of an actor's newest rollout was: the actors play while the learner trains, so one or two
+lag is how old the policy of an actor's newest rollout was: the actors play while the learner trains, so a few
 batches are normal. epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts
-rollouts, down counts snapshots. A c marks an actor that fetches compact snapshots.
+rollouts, down counts snapshots. A c marks an actor that fetches compact snapshots. rollout is how long an actor takes
+for one, waits how long it then waits for the learner and the network, trip the round trip of a small request.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
 0 alive, not begun or ended, 1 not alive or no run directory"""
@@ -95,6 +96,7 @@ def status(arguments: list[str]) -> int:
         return _check_alive(parsed.alive)
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
+        parsed.run = run_for(credentials, parsed.run)
     except SECURITY_ERRORS as error:
         print_error("status", error)
         return status_at_start(error)
@@ -103,17 +105,21 @@ def status(arguments: list[str]) -> int:
             return _watch(parsed, credentials)
         transport = connect_once(parsed.connect, credentials)
         try:
-            statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
+            found = survey(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
+            statuses = found.statuses
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
-            unanswered = "" if statuses else no_answer(transport, parsed.run)
+            unanswered = "" if statuses or found.unread else no_answer(transport, parsed.run)
             waiting = list(waiting_actors(transport))
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
         print_error("status", error)
         return NO_ANSWER
+    for line in found.left_out:
+        print_error("status", line)
     if not statuses:
-        print_error("status", f"{unanswered}{_waiting(waiting)}")
+        if unanswered:
+            print_error("status", f"{unanswered}{_waiting(waiting)}")
         return NO_ANSWER
     if parsed.quiet:
         _show_problems(statuses)
@@ -146,7 +152,7 @@ def watch_status(
       text: returns what is printed about a run where no frames are shown.
       frames: redraw one frame.
 
-    Raises TransportError if the learner refuses this process, or if its answers are damaged.
+    Raises TransportError if the learner refuses this process.
     """
     wanted = "no learner" if run == keys.ANY_RUN else f"no learner of run {run!r}"
     nobody = f"{wanted} answers at this address"
@@ -249,7 +255,8 @@ def _table(status: RunStatus) -> list[str]:
         *_expiry(status.certificate_days_left),
         f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}, "
         f"updates {status.updates:,}{skipped}",
-        f"  {status.env_steps_per_second:,.0f} env_steps/s, {status.updates_per_second:,.1f} updates/s, "
+        *([f"  {status.bottleneck}"] if status.bottleneck else []),
+        f"  {short_rate(status.env_steps_per_second)} env_steps/s, {short_rate(status.updates_per_second)} updates/s, "
         f"policy lag {policy_lag(status.policy_lag_mean, status.updates_per_batch)}",
         f"  actors: {status.actors_alive:,} alive, {status.actors_quarantined:,} quarantined, {status.actors_gone:,} "
         f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
@@ -275,8 +282,11 @@ _COLUMNS: dict[str, _Cell] = {
     "envs": lambda actor, _: f"{actor.environments}",
     "epsilon": lambda actor, _: f"{actor.epsilon:g}" if actor.epsilon else "-",
     "env_steps": lambda actor, _: f"{actor.env_steps:,}",
-    "/s": lambda actor, _: f"{actor.env_steps_per_second:,.0f}",
+    "/s": lambda actor, _: short_rate(actor.env_steps_per_second),
     "lag": lambda actor, run: policy_lag(actor.policy_lag, run.updates_per_batch).partition(" (")[0],
+    "rollout": lambda actor, _: _measured(actor.rollout_seconds),
+    "waits": lambda actor, _: _measured(actor.waiting_seconds),
+    "trip": lambda actor, _: _measured(actor.round_trip_seconds),
     "busy": lambda actor, _: f"{_busy_share(actor):.0%}",
     "accepted": lambda actor, _: f"{actor.rollouts_accepted:,}",
     "missed": lambda actor, _: f"{actor.rollouts_missed:,}" if actor.rollouts_missed else "-",
@@ -284,7 +294,7 @@ _COLUMNS: dict[str, _Cell] = {
     "down": lambda actor, _: f"{actor.bytes_down_per_hour / 1e6:,.0f}{'c' if actor.compact_snapshots else ''}",
 }
 _LEFT = ("actor", "state")  # columns of words
-_LEAST_IMPORTANT = ("down", "MB/h up", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy")
+_LEAST_IMPORTANT = ("down", "MB/h up", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy", "waits")
 
 
 def _state(actor: ActorStatus) -> str:
@@ -310,6 +320,10 @@ def _actor_table(status: RunStatus) -> list[str]:
             cells.append(text.ljust(width) if name in _LEFT else text.rjust(width))
         rows.append(f"  {'  '.join(cells)}")
     return [*rows, *([f"  --json has more columns: {', '.join(dropped)}"] if dropped else [])]
+
+
+def _measured(seconds: float) -> str:
+    return short_duration(seconds) if seconds else "-"
 
 
 def _busy_share(actor: ActorStatus) -> float:

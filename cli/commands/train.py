@@ -2,7 +2,6 @@
 
 import argparse
 import importlib.util
-import shlex
 import signal
 import sys
 from contextlib import suppress
@@ -27,6 +26,7 @@ from daedalus.launch.child_output import ChildOutput, inherited
 from daedalus.launch.environment_check import EnvironmentProblemError
 from daedalus.launch.local_run import (
     LocalRun,
+    RunEnd,
     RunFailedError,
     RunStoppedError,
     UnsavedError,
@@ -44,10 +44,12 @@ from daedalus.launch.process_lifecycle import (
 )
 from daedalus.launch.resumed_run import ResumeChoice, locked_to_resume, resumed_run, status_of
 from daedalus.launch.run_choice import create_run
+from daedalus.learner.reporting.progress import is_terminal
 from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.resuming import FinishedRun
-from daedalus.learner.run.run_lock import RunInUseError
+from daedalus.learner.run.run_files import RunDataError
+from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
@@ -122,7 +124,7 @@ def train(arguments: list[str]) -> int:
             init_from=new.init_from,
             **_machine_options(parsed, lock.directory),
         )
-        return _run(run, screen, exits_with_parent=parsed.exit_with_parent)
+        return _run(run, screen, lock, exits_with_parent=parsed.exit_with_parent)
 
 
 def resume(arguments: list[str]) -> int:
@@ -163,7 +165,7 @@ def resume(arguments: list[str]) -> int:
             say(f"nothing to do: {run.reason}")
             return status_of(run)
         run = replace(run, **_machine_options(parsed, lock.directory))
-        return _run(run, screen, exits_with_parent=parsed.exit_with_parent)
+        return _run(run, screen, lock, exits_with_parent=parsed.exit_with_parent)
 
 
 def train_parser() -> argparse.ArgumentParser:
@@ -207,7 +209,8 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
         "--watch",
         action="store_true",
         help="show the run on a page in a browser, at http://127.0.0.1:8080, or at another port if that is taken. The "
-        "token that it asks for is in RUN_DIR/operator-token",
+        "token that it asks for is in RUN_DIR/operator-token. On a terminal the page stays after the end of the run, "
+        "until Ctrl-C",
     )
     options.add_argument(
         "--clients",
@@ -244,6 +247,7 @@ def _machine_options(parsed: argparse.Namespace, directory: Path) -> dict[str, A
         "tls": parsed.tls,
         "insecure": parsed.insecure,
         "watch": parsed.watch,
+        "keeps_page": parsed.watch and is_terminal(sys.stdout) and not log_options(parsed).as_json,
         "clients": parsed.clients,
         "camera": not parsed.no_camera,
         "log": chosen_trackers(parsed.log, directory),
@@ -251,8 +255,11 @@ def _machine_options(parsed: argparse.Namespace, directory: Path) -> dict[str, A
     }
 
 
-def _run(run: LocalRun, screen: Screen, *, exits_with_parent: bool) -> int:
-    """Run to the end, print the result, and return the exit status. A finished run is only evaluated."""
+def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: bool) -> int:
+    """Run to the end, leave a report, print the result, and return the exit status.
+
+    A finished run is only evaluated.
+    """
     directory = run.directory
     live = screen.shows_frames and not run.logs.as_json
     command = "daedalus resume" if run.resume else "daedalus train"
@@ -263,23 +270,44 @@ def _run(run: LocalRun, screen: Screen, *, exits_with_parent: bool) -> int:
     stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=_DISK_SECONDS, end_seconds=_END_SECONDS)
     if exits_with_parent:
         exit_with_parent(stopping)
+
+    def show_end(end: RunEnd) -> None:
+        show("\n".join([report(run, end.summary), _left_report(directory)]), command)
+        lock.close()  # the page that is kept does not keep anybody from resuming the run
+        if run.keeps_page:
+            say("the page of the run stays open: press Ctrl-C to close it")
+
     try:
         with output:
-            end = run_locally(run, stopping, output, output.unlimited_pipes if live else inherited)
+            streams = output.unlimited_pipes if live else inherited
+            return run_locally(run, stopping, output, streams, show_end).status
     except RunStoppedError as error:
         by = f" by {error}" if str(error) else ""
-        say(f"stopped{by}; continue with: {resume_command(run)}")
+        left, how = _left_report(directory), f"stopped{by}; continue with: {resume_command(run)}"
+        show("\n".join(filter(None, [left, how])), command)
         return 1
     except RunFailedError as error:
         if str(error):
             say(f"{command}: {str(error).rstrip()}", sys.stderr)
         if not (run.resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
+        if left := _left_report(directory):
+            say(left, sys.stderr)
         if not isinstance(error, UnsavedError) and checkpoints(directory):
             say(f"when that is corrected, continue with: {resume_command(run)}", sys.stderr)
         return error.status
-    show(report(run, end.summary), command)
-    return end.status
+
+
+def _left_report(directory: Path) -> str:
+    """Write the report of a run; return the line that names it or says why there is none. Empty without metrics."""
+    if not (directory / run_directory.METRICS).exists():
+        return ""
+    from daedalus.cli.commands.report import write_report  # imports the analysis of runs, which training does not need
+
+    try:
+        return f"report: {write_report(directory)}"
+    except Exception as error:  # the result of a run, and its exit status, do not depend on a report
+        return f"no report: {error if isinstance(error, RunDataError) else f'{type(error).__name__}: {error}'}"
 
 
 def report(run: LocalRun, summary: dict[str, Any]) -> str:
@@ -302,10 +330,7 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
         f"on {evaluation['environment']} (backend {evaluation['backend']})"
     )
-    folder = f"run directory: {run.directory}"
-    if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
-        folder += f"; draw the curves with: daedalus plot {shlex.quote(str(run.directory))} --output curve.png"
-    return "\n".join([trained, *_confirmed(run, summary), evaluated, *evaluation["notes"], folder])
+    return "\n".join([trained, *_confirmed(run, summary), evaluated, *evaluation["notes"]])
 
 
 def show(text: str, command: str) -> None:

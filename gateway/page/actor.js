@@ -5,8 +5,13 @@ export const SPACES = {
   actions: { action: { kind: "discrete", counts: [2] } },
 };
 
-/** An error that another attempt cannot help. */
-export class RefusedError extends Error {}
+/** An error that another attempt cannot help. `misfit`: the run plays another environment. */
+export class RefusedError extends Error {
+  constructor(reason, misfit = false) {
+    super(reason);
+    this.misfit = misfit;
+  }
+}
 
 export class Actor {
   #socket;
@@ -54,7 +59,7 @@ export class Actor {
   #take(message) {
     const final = message.type === "run_ended" || message.code === "refused" || message.code === "misfit";
     if (final) {
-      this.#fail(new RefusedError(message.reason));
+      this.#fail(new RefusedError(message.reason, message.code === "misfit"));
     } else if (message.type === "error") {
       this.#waiting?.reject(new Error(message.reason));
     } else {

@@ -5,6 +5,7 @@ import { Connection } from "./connection.js";
 import { byId } from "./dom.js";
 import { Events } from "./events.js";
 import { Fleet } from "./fleet.js";
+import { Folder } from "./folder.js";
 import { Learning } from "./learning.js";
 import { Orders } from "./orders.js";
 import { Summary } from "./summary.js";
@@ -27,7 +28,7 @@ const connection = new Connection({
   },
   refused(reason) {
     byId("ask-token").hidden = false;
-    summary.show({ state: "forbidden", reason, status: null });
+    summary.show({ state: "forbidden", reason, ends: [], status: null });
     byId("token").focus();
   },
 });
@@ -36,6 +37,7 @@ const learning = new Learning();
 const summary = new Summary(learning.metrics);
 const fleet = new Fleet();
 const events = new Events();
+const folder = new Folder();
 const orders = new Orders(connection);
 const camera = new Camera(connection);
 
@@ -46,6 +48,7 @@ const takers = {
   },
   actors: (message) => fleet.show(message),
   events: (message) => events.show(message),
+  folder: (message) => folder.show(message),
   metrics(message) {
     learning.add(message);
     summary.tiles();

@@ -10,9 +10,9 @@ export function ticks(low, high, count) {
   const rough = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].find((factor) => factor * power >= rough) * power;
-  const found = [];
-  for (let index = Math.ceil(low / step - 1e-9); index * step <= high + 1e-9 * step; index++) found.push(index * step);
-  return found;
+  const first = Math.ceil(low / step - 1e-9);
+  const more = Math.min(Math.floor(high / step + 1e-9) - first, 2 * count); // of ends that are nearly equal, too
+  return Array.from({ length: Math.max(more + 1, 0) }, (_, index) => (first + index) * step);
 }
 
 /** Return at most two points for each pixel: the lowest and the highest of those that share it. */
@@ -39,34 +39,64 @@ export function range(lists) {
     }
   }
   if (low > high) return null;
-  const pad = high > low ? 0.05 * (high - low) : Math.abs(high) * 0.1 || 1;
+  const isFlat = high - low <= 1e-9 * Math.max(Math.abs(low), Math.abs(high));
+  const pad = isFlat ? Math.abs(high) * 0.1 || 1 : 0.05 * (high - low);
   return [low - pad, high + pad];
 }
 
-export class Chart {
-  #series = { line: [], marks: [], others: [] };
-  #scale = null;
+/** Return points whose values are the means of that many rows up to them. */
+export function smoothed(points, rows) {
+  if (rows <= 1) return points;
+  return points.map(([at], index) => {
+    const part = points.slice(Math.max(index + 1 - rows, 0), index + 1);
+    const mean = (place) => part.reduce((sum, point) => sum + point[place], 0) / part.length;
+    return [at, mean(1), mean(2)];
+  });
+}
 
-  /** `title` names the metric; `xText` returns the text of a place on the x axis. */
-  constructor(title, { wide = false, xText = number } = {}) {
+const CLICK = 6; // pixels: a pointer that moves less chooses nothing
+
+export class Chart {
+  #series = { line: [], raw: [], marks: [], others: [] };
+  #scale = null;
+  #begun = null; // where a choice began, in pixels
+
+  /**
+   * `title` names the metric; `xText` returns the text of a place on the x axis. `onChoice` receives the ends of the part
+   * that is chosen by dragging, or null after a double click. `onRemove`, if there is one, is called by a button.
+   */
+  constructor(title, { wide = false, xText = number, onChoice = () => {}, onRemove = null } = {}) {
     this.title = title;
     this.xText = xText;
     this.svg = shape("svg", { role: "img", "aria-label": `${title}: no values yet` });
     this.reading = element("span", { class: "reading" });
     const caption = element("figcaption", {}, element("h3", {}, title), this.reading);
+    if (onRemove) {
+      const button = element("button", { type: "button", class: "remove", "aria-label": `Remove ${title}` }, "×");
+      button.onclick = onRemove;
+      caption.append(button);
+    }
     this.figure = element("figure", { class: wide ? "chart wide" : "chart" }, caption, this.svg);
-    this.svg.addEventListener("pointermove", (event) => this.#point(event.offsetX));
-    this.svg.addEventListener("pointerleave", () => this.draw(this.#series));
+    this.onChoice = onChoice;
+    this.svg.addEventListener("pointerdown", ({ offsetX }) => (this.#begun = offsetX));
+    this.svg.addEventListener("pointermove", ({ offsetX }) => this.#point(offsetX));
+    this.svg.addEventListener("pointerup", ({ offsetX }) => this.#chooseTo(offsetX));
+    this.svg.addEventListener("pointerleave", () => this.#leave());
+    this.svg.addEventListener("dblclick", () => this.onChoice(null));
     new ResizeObserver(() => this.draw(this.#series)).observe(this.svg);
   }
 
-  /** Draw points [x, y, half width of the band] of the line, the marks, and [number, points] of other runs. */
+  /**
+   * Draw points [x, y, half width of the band] of the line, of the line before it was smoothed, the marks, and
+   * [number, points] of other runs.
+   */
   draw(series) {
     this.#series = series;
+    if (this.#begun !== null) return; // the scale stays while a part is chosen
     const { clientWidth: width, clientHeight: height } = this.svg;
     if (!width) return; // hidden
     this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    const all = [series.line, series.marks, ...series.others.map(([, points]) => points)];
+    const all = [series.line, series.raw, series.marks, ...series.others.map(([, points]) => points)];
     const ys = range(all);
     if (ys === null) {
       this.#scale = null;
@@ -79,7 +109,8 @@ export class Chart {
     const plot = { left: MARGIN.left, right: width - MARGIN.right, top: MARGIN.top, bottom: height - MARGIN.bottom };
     const x = (value) => plot.left + ((value - first) / (last - first || 1)) * (plot.right - plot.left);
     const y = (value) => plot.bottom - ((value - ys[0]) / (ys[1] - ys[0])) * (plot.bottom - plot.top);
-    this.#scale = { x, y, plot };
+    const valueAt = (place) => first + ((place - plot.left) / (plot.right - plot.left)) * (last - first);
+    this.#scale = { x, y, plot, valueAt };
     const points = thinned(series.line, plot.right - plot.left);
     this.svg.replaceChildren(
       ...this.#axes(first, last, ys, plot, x, y),
@@ -87,6 +118,7 @@ export class Chart {
       ...series.others.map(([place, other]) =>
         shape("path", { class: `other series-${place}`, d: path(thinned(other, plot.right - plot.left), x, y) }),
       ),
+      shape("path", { class: "raw", d: path(thinned(series.raw.map(([at, value]) => [at, value, 0]), plot.right - plot.left), x, y) }),
       shape("path", { class: "line", d: path(points, x, y) }),
       ...(points.length === 1 ? points : series.marks).map(([at, value]) => shape("circle", { class: "mark", cx: x(at), cy: y(value), r: 3 })),
     );
@@ -113,7 +145,20 @@ export class Chart {
     this.svg.setAttribute("aria-label", `${this.title}: ${newest} at the end, ${where}`);
   }
 
-  /** Show the value below the pointer. */
+  /** Choose the part from where the pointer went down to where it is. */
+  #chooseTo(at) {
+    const [from, scale] = [this.#begun, this.#scale];
+    this.#begun = null;
+    if (scale === null || from === null || Math.abs(at - from) < CLICK) return;
+    this.onChoice([from, at].sort((one, other) => one - other).map(scale.valueAt));
+  }
+
+  #leave() {
+    this.#begun = null;
+    this.draw(this.#series);
+  }
+
+  /** Show the value below the pointer, and the part that is being chosen. */
   #point(at) {
     const { line } = this.#series;
     if (!line.length || this.#scale === null) return;
@@ -125,6 +170,10 @@ export class Chart {
       shape("line", { class: "cursor", x1: place, x2: place, y1: plot.top, y2: plot.bottom }),
       shape("circle", { class: "mark cursor", cx: place, cy: y(nearest[1]), r: 3 }),
     );
+    if (this.#begun !== null) {
+      const size = { x: Math.min(this.#begun, at), width: Math.abs(at - this.#begun), y: plot.top, height: plot.bottom - plot.top };
+      this.svg.append(shape("rect", { class: "cursor choice", ...size }));
+    }
     const width = nearest[2] ? ` ± ${number(nearest[2])}` : "";
     setText(this.reading, `${number(nearest[1])}${width} at ${this.xText(nearest[0])}`);
   }

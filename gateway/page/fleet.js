@@ -8,9 +8,9 @@ const MANY = 50; // actors, from which on the hosts are shown too
 // Fields of the status with a column of their own, or without one. All others have a column where they are not empty.
 const KNOWN = new Set(`actor host software address alive quarantined lives seconds_since_seen environments env_steps
   env_steps_per_second rollouts_accepted rollouts_rejected rollouts_missed busy_answers policy_lag compact_snapshots
-  bytes_up_per_hour bytes_down_per_hour`.split(/\s+/));
+  bytes_up_per_hour bytes_down_per_hour rows silence_limit_seconds`.split(/\s+/));
 
-const TITLES = { epsilon: "Exploration" };
+const TITLES = { epsilon: "Exploration", rollout_seconds: "Rollout (s)", waiting_seconds: "Waits (s)", round_trip_seconds: "Trip (s)" };
 
 const stateOf = (actor) => (actor.quarantined ? "quarantined" : actor.alive ? "alive" : "gone");
 const sum = (values) => values.reduce((total, value) => total + value, 0);

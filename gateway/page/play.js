@@ -24,13 +24,15 @@ async function play(game) {
       const welcome = await game.actor.join(byId("name").value, byId("token").value);
       const longest = LONGEST[welcome.environment];
       if (longest === undefined) {
-        throw new RefusedError(`the run plays ${welcome.environment}, and this page can play CartPole only`);
+        throw new RefusedError(`the run plays ${welcome.environment}, and this page can play CartPole only`, true);
       }
+      byId("elsewhere").hidden = true;
       say(`Playing as ${welcome.name}, an actor of the run ${welcome.run}. It learns from these steps.`);
       while (playing === game) await playEpisode(game, longest);
     } catch (error) {
       if (playing !== game) break;
       game.actor.close();
+      byId("elsewhere").hidden = !error.misfit;
       if (error instanceof RefusedError) return stop(`Not playing: ${error.message}.`);
       say(`${error.message}; trying again soon.`);
       await wait(PAUSE_MILLISECONDS);

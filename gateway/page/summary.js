@@ -9,6 +9,7 @@ const STATES = {
   waiting: "waiting for a learner",
   running: "running",
   lost: "the learner does not answer",
+  stopped: "stopped",
   ended: "ended",
   closed: "the gateway does not answer",
 };
@@ -19,8 +20,11 @@ const EXPLANATIONS = {
   closed: "The gateway does not answer. The figures are the last ones; this page connects again by itself.",
 };
 
+const OVER = new Set(["ended", "stopped"]);
+
 export class Summary {
-  #seen = { state: "connecting", reason: "", status: null };
+  #seen = { state: "connecting", reason: "", ends: [], status: null };
+  #isLost = false; // whether the gateway is gone
   #tiles = new Map();
 
   takesClients = false; // whether /play may take part
@@ -32,6 +36,7 @@ export class Summary {
   /** Show a message about the run. */
   show(message) {
     this.#seen = message;
+    this.#isLost = false;
     const { state, status } = message;
     byId("state").dataset.state = state;
     setText(byId("state"), STATES[state]);
@@ -39,24 +44,31 @@ export class Summary {
     if (status === null) return;
     setText(byId("run"), status.run);
     setText(byId("what"), `${status.environment}, ${status.algorithm}`);
-    const plays = /^CartPole-v[01]$/.test(status.environment) && state !== "ended";
+    const plays = /^CartPole-v[01]$/.test(status.environment) && !OVER.has(state);
     byId("play").hidden = !plays || !this.takesClients;
     this.#progress(status);
+    setText(byId("bottleneck"), state === "running" ? status.bottleneck : "");
     this.tiles();
     document.title = `${status.run}: ${number(status.episode_return_mean)} - Daedalus`;
   }
 
   /** Show that the gateway is gone, with the last figures. */
   lost(reason) {
-    if (this.#seen.state !== "ended") this.show({ ...this.#seen, state: "closed", reason });
+    if (!OVER.has(this.#seen.state)) return this.show({ ...this.#seen, state: "closed", reason });
+    this.#isLost = true;
+    this.#notice(this.#seen);
   }
 
-  #notice({ state, reason, status }) {
+  #notice({ state, reason, ends, status }) {
     const notices = [];
-    if (state === "ended") notices.push(["notice good", `The run has ended: ${reason}. ${this.#result(status)}`]);
+    const why = reason && `: ${reason}`;
+    if (state === "ended") notices.push(["notice good", `The run has ended${why}. ${this.#result(status)}`]);
+    else if (state === "stopped") notices.push(["notice", `The run was stopped${why}. ${this.#result(status)}`]);
     else if (EXPLANATIONS[state]) notices.push(["notice", EXPLANATIONS[state] + (reason ? ` (${reason})` : "")]);
     else if (reason) notices.push(["notice", reason]);
     if (state === "running") for (const problem of status?.problems ?? []) notices.push(["notice", `Problem: ${problem}`]);
+    if (OVER.has(state)) notices.push(...ends.map((line) => ["notice", line]));
+    if (this.#isLost) notices.push(["notice", "The gateway has ended, too: this page keeps what it shows, until you close it."]);
     const shown = [...byId("notices").children].map((child) => child.textContent).join("\n");
     if (shown === notices.map(([, text]) => text).join("\n")) return; // a screen reader hears each notice once
     byId("notices").replaceChildren(...notices.map(([style, text]) => element("p", { class: style }, text)));
@@ -93,7 +105,7 @@ export class Summary {
     );
     this.#tile("env_steps/s", number(status.env_steps_per_second), `${number(status.updates_per_second)} updates/s`);
     const [lag, inUpdates] = policyLag(status.policy_lag_mean, status.updates_per_batch);
-    this.#tile("Policy lag", lag, `${inUpdates ? `${inUpdates}, ` : ""}mean of the last second`);
+    this.#tile("Policy lag", lag, `${inUpdates ? `${inUpdates}, ` : ""}mean of the newest batches`);
     const absent = [[status.actors_quarantined, "quarantined"], [status.actors_gone, "gone"]];
     const others = absent.filter(([count]) => count).map(([count, what]) => `${whole(count)} ${what}`);
     this.#tile("Actors", whole(status.actors_alive), others.join(", ") || "none gone");

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from daedalus.gateway.watching.page_data import Observation, RunSource
+from daedalus.gateway.watching.page_data import Observation, ReadFolder, RunSource
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.transport.interface import TransportError
@@ -27,6 +27,7 @@ class RunMonitor:
         source: RunSource,
         on_observation: Callable[[Observation], None],
         ended: Callable[[], str] = lambda: "",
+        read_folder: ReadFolder = lambda run: None,
     ) -> None:
         """Construct the monitor.
 
@@ -34,8 +35,10 @@ class RunMonitor:
           source: the learner.
           on_observation: called on the monitor's thread.
           ended: returns how the run ended, or an empty string while it goes on.
+          read_folder: reads the directory of the run.
         """
         self._source, self._on_observation, self._ended = source, on_observation, ended
+        self._read_folder = read_folder
         self._seen = Observation(state="waiting")
         self._watched, self._stop, self._wake = False, threading.Event(), threading.Event()
         self._actors_due = 0.0
@@ -46,11 +49,11 @@ class RunMonitor:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop observing. At most about 3 s."""
+        """Stop observing. At most about 1 s."""
         self._stop.set()
         self._wake.set()
         if self._thread.is_alive():
-            self._thread.join(3.0)
+            self._thread.join(1.0)
 
     def watch(self, watched: bool) -> None:
         """Set whether somebody watches. From any thread."""
@@ -65,9 +68,22 @@ class RunMonitor:
     def _run(self) -> None:
         while not self._stop.is_set():
             self._wake.clear()
-            self._seen = self._observed()
+            self._seen = self._with_folder(self._observed())
             self._on_observation(self._seen)
             self._wake.wait(WATCHED_SECONDS if self._watched else UNWATCHED_SECONDS)
+
+    def last_look(self) -> Observation:
+        """Return the last observation, with what the run directory has by now. Call it after `close`."""
+        return self._with_folder(self._seen, is_last=True)
+
+    def _with_folder(self, seen: Observation, *, is_last: bool = False) -> Observation:
+        """Add what the run directory has. It says how the run ended if the learner could not say so any more."""
+        if seen.status is None:
+            return seen
+        folder = self._read_folder(seen.status.run)
+        if folder is not None and folder.ends and (seen.state == "lost" or (is_last and seen.state == "running")):
+            seen = replace(seen, state="stopped" if folder.stopped else "ended", reason="")
+        return replace(seen, folder=folder)
 
     def _observed(self) -> Observation:
         try:

@@ -44,12 +44,26 @@ class OtherRun:
     rows: list[dict[str, float]]  # by column
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FolderView:
+    """What the run directory has for the page. Texts are printable and without secrets."""
+
+    settings: tuple[tuple[str, str, bool], ...]  # `section.key`, value, and whether it differs from the default
+    output: str  # the last lines that actors and evaluations printed
+    ends: tuple[str, ...] = ()  # once the learner has ended: result, report and what to do
+    stopped: bool = False  # whether it ended before the run was over
+
+
+ReadFolder = Callable[[str], FolderView | None]  # by the name of the run; None: there is no directory of that run
+
+
 State = Literal[
     "connecting",  # the network is not reached yet
     "forbidden",  # this gateway may not read the status
     "waiting",  # no learner has answered yet
     "running",
     "lost",  # the learner answered before, and does not now
+    "stopped",  # the learner has ended before the run was over
     "ended",
 ]
 _DIGITS = 6
@@ -67,12 +81,20 @@ class Observation:
     events: tuple[Event, ...] = ()
     generation: int = 0  # of the rows: another one begins with the first row again
     rows: tuple[tuple[int, dict[str, float]], ...] = ()  # number and values by column
+    folder: FolderView | None = None
 
 
 def run_message(seen: Observation) -> dict[str, Any]:
     """Return the message about the run as a whole."""
     status = None if seen.status is None else seen.status.model_dump(mode="json", exclude=_NOT_FOR_THE_PAGE)
-    return {"type": "run", "state": seen.state, "reason": seen.reason, "status": status}
+    ends = seen.folder.ends if seen.folder and seen.state in ("stopped", "ended") else ()
+    return {"type": "run", "state": seen.state, "reason": seen.reason, "ends": ends, "status": status}
+
+
+def folder_message(folder: FolderView, *, readable: bool) -> dict[str, Any]:
+    """Return the message about the run directory, whose parts are None if the viewer may not read it."""
+    settings, output = (folder.settings, folder.output) if readable else (None, None)
+    return {"type": "folder", "settings": settings, "output": output}
 
 
 def actors_message(actors: tuple[ActorStatus, ...]) -> dict[str, Any]:
@@ -111,6 +133,7 @@ def _short(value: Any) -> Any:
 
 MAX_VIEWERS = 32
 _OPERATORS = 4  # further pages, for operators
+_LAST_SECONDS = 1.0  # to send the last observation
 
 GiveOrder = Callable[[Order, str], tuple[bool, str]]  # waits for the learner, as RunSource.order
 
@@ -149,7 +172,9 @@ class PageData:
         self.give_order: GiveOrder = _nobody
         self.on_watch: Callable[[bool], None] = lambda watched: None  # receives whether anybody watches
         self.places = Places(MAX_VIEWERS, "pages", reserved=_OPERATORS)
+        self.is_closing = False  # the observation is the last
         self._changed = asyncio.Event()
+        self._showing: set[asyncio.Task[None]] = set()
 
     @property
     def is_watched(self) -> bool:
@@ -161,6 +186,18 @@ class PageData:
         self.seen = seen
         self._changed.set()
         self._changed = asyncio.Event()
+
+    def begin(self, showing: asyncio.Task[None]) -> None:
+        """Note the task that sends the observations to one viewer. It ends after the last observation."""
+        self._showing.add(showing)
+        showing.add_done_callback(self._showing.discard)
+
+    async def close(self, last: Observation | None) -> None:
+        """Show a last observation to all viewers, and wait until it is sent. At most about 1 s."""
+        self.is_closing = True
+        self.show(self.seen if last is None else last)
+        if self._showing:
+            await asyncio.wait(list(self._showing), timeout=_LAST_SECONDS)
 
     @property
     def news(self) -> asyncio.Event:

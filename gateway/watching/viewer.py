@@ -93,6 +93,7 @@ class ViewerConnection:
         self._sent: Observation | None = None
         self._camera: asyncio.Task[None] | None = None
         self._task: asyncio.Task[Any] | None = None
+        self._reads_folder = False
         self._end: ClientError | None = None  # why the gateway ends the connection
 
     async def serve(self) -> None:
@@ -104,6 +105,7 @@ class ViewerConnection:
         try:
             owner = await self._greet()
             is_operator = owner.startswith(OPERATOR)
+            self._reads_folder = bool(owner)  # without a token: whoever reaches the gateway; a run directory is private
             try:
                 with self._data.places.take(owner or self._channel.peer, self.end, is_operator=is_operator):
                     self._channel.settle(True)
@@ -143,6 +145,7 @@ class ViewerConnection:
         offers = {"orders": self._guard.takes_orders, "camera": data.camera is not None, "clients": data.takes_clients}
         await self._send({"type": "hello", **offers})
         showing = asyncio.create_task(self._show())
+        data.begin(showing)
         try:
             await self._obey()
         finally:
@@ -164,6 +167,8 @@ class ViewerConnection:
                 seen = self._data.seen
                 await self._send_texts(await asyncio.to_thread(self._changes, seen))
                 self._sent = seen
+                if self._data.is_closing and seen is self._data.seen:
+                    return
                 await news.wait()
 
     def _changes(self, seen: Observation) -> list[dict[str, Any]]:
@@ -173,6 +178,8 @@ class ViewerConnection:
             messages.append(page_data.actors_message(seen.actors))
         if sent is None or seen.events is not sent.events:
             messages.append(page_data.events_message(seen.events))
+        if seen.folder is not None and (sent is None or seen.folder != sent.folder):
+            messages.append(page_data.folder_message(seen.folder, readable=self._reads_folder))
         if sent is None or sent.generation != seen.generation:
             messages.append(page_data.metrics_message(seen, False, 0))
         elif seen.rows is not sent.rows:

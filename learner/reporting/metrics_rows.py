@@ -96,6 +96,7 @@ class Details:
     returns: Sequence[float] = ()  # of the newest episodes
     lengths: Sequence[int] = ()
     action_counts: Mapping[str, Sequence[int]] = field(default_factory=dict)  # by component, since the last
+    waits_for: str = ""  # what the first batch waits for, for the progress; empty once there is a batch
     picture: np.ndarray | None = None  # one observation as the network receives it: uint8 [H, W] or [H, W, 3]
 
     @property

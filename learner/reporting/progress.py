@@ -4,16 +4,14 @@ import logging
 import os
 import shutil
 import time
-from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import TextIO
 
-from daedalus.protocol.texts import policy_lag, short_number
+from daedalus.protocol.texts import policy_lag, short_number, short_rate
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
-_RATE_SECONDS = 30.0  # of the run, over which the rate of the env_steps is measured
 
 
 _logger = logging.getLogger(__name__)
@@ -28,18 +26,18 @@ class Progress:
         self._terminal = is_terminal(stream)
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
         self._rewriting = False
-        self._rate = StepRate()
 
-    def show(self, row: Mapping[str, float]) -> None:
-        """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds."""
-        rate = self._rate.add(row["wall_seconds"], row["env_steps"])
-        if rate is None:
-            rate = row.get("env_steps_per_second", 0.0)
+    def show(self, row: Mapping[str, float], waits_for: str = "") -> None:
+        """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds.
+
+        `waits_for` is what the first batch waits for: without it, the row has no figures. Empty: there is a batch.
+        """
         if not self._terminal:
             if time.monotonic() < self._next_line:
                 return
             self._next_line = time.monotonic() + _LINE_SECONDS
-        parts = _parts(row, self._budget, rate, self._updates_per_batch)
+        parts = _parts(row, self._budget, self._updates_per_batch)
+        parts = [parts[0], waits_for, parts[-1]] if waits_for else parts
         if self._terminal:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
             self._write(f"\r\x1b[K{line}")
@@ -67,23 +65,8 @@ class Progress:
 class SilentProgress(Progress):
     """Progress of a run that another process shows."""
 
-    def show(self, row: Mapping[str, float]) -> None:
+    def show(self, row: Mapping[str, float], waits_for: str = "") -> None:
         """Show nothing."""
-
-
-class StepRate:
-    """Rate of the env_steps over the newest seconds: slow environments make steps in few of the rows."""
-
-    def __init__(self) -> None:
-        self._seen: deque[tuple[float, float]] = deque()  # seconds and env_steps
-
-    def add(self, seconds: float, env_steps: float) -> float | None:
-        """Return the env_steps per second until now, or None if no time has passed since the first call."""
-        self._seen.append((seconds, env_steps))
-        while len(self._seen) > 2 and seconds - self._seen[1][0] >= _RATE_SECONDS:
-            self._seen.popleft()
-        first_seconds, first_env_steps = self._seen[0]
-        return (env_steps - first_env_steps) / (seconds - first_seconds) if seconds > first_seconds else None
 
 
 def is_terminal(stream: TextIO) -> bool:
@@ -91,8 +74,9 @@ def is_terminal(stream: TextIO) -> bool:
     return stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
 
 
-def _parts(row: Mapping[str, float], budget: int, rate: float, updates_per_batch: int) -> list[str]:
+def _parts(row: Mapping[str, float], budget: int, updates_per_batch: int) -> list[str]:
     """Return the parts of a line, the most important first. What is not known yet is a dash."""
+    rate, updates = row.get("env_steps_per_second", 0.0), row.get("updates_per_second")
     mean = short_number(row["episode_return_mean"]) if "episode_return_mean" in row else "-"
     lag = policy_lag(row["policy_lag_mean"], updates_per_batch) if "policy_lag_mean" in row else "-"
     left = duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
@@ -100,19 +84,15 @@ def _parts(row: Mapping[str, float], budget: int, rate: float, updates_per_batch
         f"{row['wall_seconds']:7.1f} s",
         f"return {mean:>7}",
         f"env_steps {row['env_steps']:>11,} ({100.0 * row['env_steps'] / budget:.0f} %)",
-        f"{_number(rate or None, ',.0f'):>7}/s",
+        f"{short_rate(rate) if rate else '-':>7}/s",
         f"left {left:>6}",
-        f"updates {_number(row.get('updates_per_second'), ',.0f'):>5}/s",
+        f"updates {'-' if updates is None else short_rate(updates):>5}/s",
         f"lag {lag}",
         f"actors {row['actors']}",
     ]
     if "episode_length_mean" in row:
         parts.insert(5, f"length {row['episode_length_mean']:>6,.0f}")
     return parts
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
 
 
 def _fitted(parts: list[str], width: int) -> str:

@@ -73,7 +73,7 @@ class Recorder:
 
     def _work(self) -> None:
         while (taken := self._rows.get()) is not None:
-            self._progress.show(taken[0])
+            self._progress.show(taken[0], taken[1].waits_for)
             self.busy_since = time.monotonic()
             with reserved_descriptors():
                 if self._failed_at is None or time.monotonic() >= self._failed_at + _RETRY_SECONDS:

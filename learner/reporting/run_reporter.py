@@ -3,14 +3,17 @@
 import logging
 import math
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daedalus.learner.reporting.bottleneck import bottleneck
 from daedalus.learner.reporting.csv_writer import cut_rows
 from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint
 from daedalus.learner.reporting.metrics_rows import ENV, Details, read_rows
+from daedalus.learner.reporting.rates import RateMeter
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.user_metrics import UserMetrics
@@ -18,7 +21,6 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.run_directory import EVALUATION, METRICS, SUMMARY, read_json, write_json
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import RESUMED
-from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import page, totals
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.policy.saving.best_checkpoints import set_aside_newer
@@ -47,53 +49,6 @@ def episode_statistics(counters: RunCounters) -> dict[str, float]:
     }
 
 
-class RateMeter:
-    """Rates since the last measurement."""
-
-    def __init__(self, counters: RunCounters, now: float) -> None:
-        self.rates: dict[str, float] = {}  # of the last measurement
-        self._actors: dict[str, tuple[int, int, int]] = {}  # env_steps, received bytes, answered bytes
-        self._pushed_bytes = 0
-        self._begun, self._first_env_steps, self._first_rollouts = now, counters.env_steps, counters.rollouts_trained
-        self._mark(counters, now)
-
-    def overall(self, counters: RunCounters, now: float) -> float:
-        """Return env_steps per second since construction."""
-        return (counters.env_steps - self._first_env_steps) / max(now - self._begun, 1e-9)
-
-    def _mark(self, counters: RunCounters, now: float) -> None:
-        self._then, self._env_steps, self._updates = now, counters.env_steps, counters.updates
-        self._rollouts, self._lag = counters.rollouts_trained, counters.policy_lag_sum
-
-    def measure(self, counters: RunCounters, fleet: Fleet, now: float, *, last: bool = False) -> dict[str, float]:
-        """Return env_steps and updates per second and the mean policy lag, since the last measurement.
-
-        What is unknown is absent: all of it before the first batch, and the policy lag of no batch. The `last` interval
-        of a run ends at any moment: without a batch in it, nothing is known. Also sets the rates of each actor in
-        `fleet`. `now` is on the monotonic clock, in seconds.
-        """
-        seconds = max(now - self._then, 1e-9)
-        pushed, self._pushed_bytes = fleet.pushed_bytes - self._pushed_bytes, fleet.pushed_bytes
-        for actor in fleet.actors.values():
-            totals = actor.env_steps, actor.received_bytes, actor.answered_bytes
-            env_steps, received, answered = np.subtract(totals, self._actors.get(actor.name, (0, 0, 0))) / seconds
-            self._actors[actor.name] = totals
-            subscribed = 0.0 if actor.fetches or not fleet.is_live(actor) else pushed / seconds
-            actor.env_steps_per_second = float(env_steps)
-            actor.bytes_up_per_hour = 3600 * float(received)
-            actor.bytes_down_per_hour = 3600 * float(answered + subscribed)
-        self._actors = {name: self._actors[name] for name in fleet.actors}  # without evicted actors
-        rollouts = counters.rollouts_trained - self._rollouts
-        self.rates = {}
-        if rollouts or (counters.rollouts_trained > self._first_rollouts and not last):
-            self.rates["env_steps_per_second"] = (counters.env_steps - self._env_steps) / seconds
-            self.rates["updates_per_second"] = (counters.updates - self._updates) / seconds
-        if rollouts:
-            self.rates["policy_lag_mean"] = (counters.policy_lag_sum - self._lag) / rollouts
-        self._mark(counters, now)
-        return self.rates
-
-
 class RunReporter:
     """Reporter of one run: its status, and during training, from `begin` to `close`, its metrics rows and summary.
 
@@ -106,6 +61,7 @@ class RunReporter:
         self._details_at = -math.inf  # when the next details are due
         training = context.spec.training
         self._meter = RateMeter(self._counters, context.health.started)
+        self._bottleneck = ""  # at the newest row
         self._episode_hint = EpisodeHint(training.env_steps)
         self._learning_hint = LearningHint(training.env_steps, normalizes_rewards=training.normalize_rewards)
 
@@ -113,7 +69,7 @@ class RunReporter:
         """Start to measure rates, at the start of training. The recorder is closed with the reporter."""
         self._recorder, health = recorder, self._context.health
         self._meter = RateMeter(self._counters, now)
-        health.updated = health.actor_seen = now
+        health.updated = health.awaited_since = health.actor_seen = now
         health.recording_since = lambda: recorder.busy_since
 
     def record(self, learner: "Learner", now: float, *, last: bool = False) -> None:
@@ -121,7 +77,10 @@ class RunReporter:
         assert self._recorder is not None
         row = self.row(learner, now, last=last)
         self._context.history.add(row)
-        self._recorder.record(row, self._details(learner, now, last=last))
+        details = self._details(learner, now, last=last)
+        # Until there is a batch, this is all that is known.
+        waits_for = "" if "updates_per_second" in row else self._bottleneck
+        self._recorder.record(row, replace(details, waits_for=waits_for))
         if not last and (hint := self._hint()):
             _logger.warning("%s", hint)
 
@@ -133,15 +92,17 @@ class RunReporter:
     def row(self, learner: "Learner", now: float, *, last: bool = False) -> dict[str, float]:
         """Return a metrics row: columns of metrics_rows.py, and the scalars of the environment and of the program.
 
-        Rates and means are since the previous row. `last` marks the row of a stop.
+        Means are since the previous row, rates over at least 10 s (rates.py). `last` marks the row of a stop.
         """
         learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
         context, counters, fleet = self._context, self._counters, self._context.fleet
         with context.lock:
             progress = context.progress
-            rates = self._meter.measure(counters, fleet, now, last=last)
-            if fleet.live:
-                context.health.actor_seen = now
+            context.health.note_actors(len(fleet.live), now)
+            is_stalled = context.health.is_stalled(now, context.expected_batch_seconds)
+            rates = self._meter.measure(counters, fleet, now, last=last, is_stalled=is_stalled)
+            if not last:
+                self._bottleneck = self._waits_for()
             row = {
                 "wall_seconds": context.wall_seconds(now),
                 "env_steps": counters.env_steps,
@@ -163,6 +124,13 @@ class RunReporter:
             }
         self._learning_hint.add(row)
         return row
+
+    def _waits_for(self) -> str:
+        """Return what the run waits for. Needs the lock."""
+        spec, fleet = self._context.spec, self._context.fleet
+        reports = filter(None, (fleet.actors[name].report for name in fleet.live))
+        together, length = spec.algorithm.synchronous, spec.collection.rollout_length
+        return bottleneck(self._meter.rates, reports, rollout_length=length, together=together) if fleet.live else ""
 
     def _hint(self) -> str:
         """Return a hint for the user if one is due, else an empty string."""
@@ -199,16 +167,16 @@ class RunReporter:
             learner_epoch=context.learner_epoch,
             algorithm=spec.training.algorithm,
             environment=spec.environment.id,
-            problems=health.problems(now, len(fleet.live)),
+            problems=health.problems(now, len(fleet.live), context.expected_batch_seconds),
             uptime_seconds=now - health.started,
             env_steps=counters.env_steps,
             env_steps_budget=spec.training.env_steps,
             updates=counters.updates,
             updates_skipped=counters.updates_skipped,
             episode_return_mean=counters.episode_return_mean,
-            env_steps_per_second=rates.get("env_steps_per_second", 0.0),
-            updates_per_second=rates.get("updates_per_second", 0.0),
-            policy_lag_mean=rates.get("policy_lag_mean", 0.0),
+            env_steps_per_second=rates.env_steps_per_second,
+            updates_per_second=rates.updates_per_second,
+            policy_lag_mean=rates.policy_lag_mean,
             queue_bytes=queue_bytes,
             queue_bytes_limit=spec.service.queue_bytes,
             checkpoint_age_seconds=None if health.saved is None else now - health.saved,
@@ -219,6 +187,9 @@ class RunReporter:
             refused_joins=fleet.refused_joins.report(now),
             actors=page(fleet, "", now),
             updates_per_batch=spec.training.updates_per_batch,
+            bottleneck=self._bottleneck,
+            learning_share=rates.learning_share,
+            decoding_share=rates.decoding_share,
         )
 
     def summary(self, *, finished: bool, now: float, stopped_by: str = "") -> dict[str, Any]:
@@ -252,6 +223,7 @@ class RunReporter:
             "rollouts_rejected": dict(counters.rollouts_rejected),
             "rollout_bytes_per_env_step": counters.rollout_bytes / max(counters.accepted_env_steps, 1),
             "snapshots_published": counters.snapshots_published,
+            "bottleneck": self._bottleneck,
         }
 
     def write_summary(

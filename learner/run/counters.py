@@ -103,6 +103,8 @@ class RunCounters:
     seconds_to_target: float | None = None  # duration of the run until the target was reached; None if it was not
     returns: deque[float] = field(init=False)
     lengths: deque[int] = field(init=False)
+    learning_seconds: float = 0.0  # that this process computed updates; not saved
+    decoding_seconds: float = 0.0  # that it decoded rollouts; not saved
     info: dict[str, deque[float]] = field(default_factory=dict)  # newest scalars of the environment; not saved
 
     def __post_init__(self) -> None:

@@ -4,12 +4,14 @@ Values are limited in depth and size too, so that others can compare and print t
 """
 
 import json
+import os
 import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
-from daedalus.policy.saving.regular_files import read_regular
+from daedalus.policy.saving.regular_files import open_regular, read_regular
+from daedalus.protocol.texts import without_secrets
 
 _MAX_JSON_BYTES, _MAX_TOML_BYTES = 32 << 20, 1 << 20
 _MAX_DEPTH = 64  # of lists and maps within each other; Python's recursion limit is not far above
@@ -36,6 +38,24 @@ def read_file(path: Path, limit: int) -> bytes | None:
     if len(content) > limit:
         raise RunDataError(f"{path} is larger than {limit >> 20} MiB, the limit for such a file of a run")
     return content
+
+
+def read_end(path: Path, most_bytes: int) -> str:
+    """Return the last whole lines of a text without secrets; empty for a link, or what cannot be read.
+
+    A link could lead to any file of the reader's. A line that would be cut is left out: without the name before it, a
+    secret is not known as one.
+    """
+    if path.is_symlink():
+        return ""
+    try:
+        with open_regular(path) as file:
+            begin = max(os.fstat(file.fileno()).st_size - most_bytes, 0)
+            file.seek(begin)
+            text = file.read(most_bytes).decode("utf-8", "replace")
+    except OSError:
+        return ""
+    return without_secrets((text.partition("\n")[2] if begin else text).strip())
 
 
 def read_json(path: Path) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ import re
 import shlex
 import tomllib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from daedalus.learner.run.setting_errors import ambiguous, known_names, one_line
 from daedalus.protocol.algorithms import check_algorithm
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec, TrainingSpec
+from daedalus.protocol.texts import exact_number, without_secrets
 
 # Tables of arguments: their values have no type that would refuse a wrong one.
 _TABLES = {
@@ -242,6 +243,32 @@ def run_spec(settings: dict[str, Any]) -> RunSpec:
         return RunSpec.model_validate(plain)
     except ValidationError as error:
         raise SettingsError(one_line(error)) from None
+
+
+def value_text(value: Any) -> str:
+    """Return a value of a setting in few characters."""
+    if value is None:
+        return "unset"
+    if isinstance(value, float):
+        return exact_number(value)
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+
+
+def setting_text(value: object) -> str:
+    """Return the value of a setting as text of limited length."""
+    shown = without_secrets(value_text(value) if not isinstance(value, dict | list) else json.dumps(value))
+    return shown if len(shown) <= 400 else f"{shown[:400]}..."
+
+
+def changed_settings(settings: Mapping[str, Any]) -> list[str]:
+    """Return which settings, by `section.key` as JSON has them, differ from the defaults of this release.
+
+    The environment's id, which has no default, and settings of another release are among them.
+    """
+    known = RunSpec.model_validate({"environment": {"id": "none"}}).model_dump(mode="json")
+    defaults = {f"{section}.{key}": value for section, values in known.items() for key, value in values.items()}
+    del defaults["environment.id"]
+    return [path for path, value in settings.items() if path not in defaults or value != defaults[path]]
 
 
 def unmeasured_target(spec: RunSpec) -> str:

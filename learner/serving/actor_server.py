@@ -300,7 +300,7 @@ class ActorServer:
         request.reply(self._joins.join(name, request.payload, time.monotonic()))
 
     def _on_report(self, request: Request) -> None:
-        request.reply(self._joins.report(keys.last_chunk(request.key), request.payload))
+        request.reply(self._joins.report(keys.last_chunk(request.key), request.payload, time.monotonic()))
 
     def _on_status(self, request: Request) -> None:
         if request.payload != LOOK:

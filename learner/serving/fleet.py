@@ -71,6 +71,11 @@ class Fault:
 NON_FINITE = Fault("non_finite", "no finite gradient", ": its observations or rewards are too large")
 
 
+# Silence of an actor for so long, or for so many of the longest times between two of its signs of life, is unusual.
+_SILENCE_SECONDS, _SILENCE_TIMES = 60.0, 3.0
+_REMEMBERED = 0.8  # of the longest time between two signs of life, at each
+
+
 @dataclass(slots=True)
 class Actor:
     """State of one actor; the counts are over all its incarnations."""
@@ -83,7 +88,8 @@ class Actor:
     origin: Origin = UNKNOWN  # of the newest incarnation
     environments: int = 0  # 0 before the actor has joined with its spaces
     joined: float = 0.0  # when the newest incarnation joined
-    last_seen: float = 0.0
+    last_seen: float = 0.0  # its last sign of life: a rollout or a report, or that it connected
+    longest_silence: float = 0.0  # of the last times between two signs of life of this incarnation, in seconds
     left: bool = False  # whether the newest incarnation was present and is no longer
     sequences: SequenceWindow = field(default_factory=SequenceWindow)  # of the newest incarnation
     uploads: int = 0  # rollouts or gradients of the newest incarnation that were received, whatever their verdict
@@ -107,7 +113,7 @@ class Actor:
     answered_bytes: int = 0  # requested snapshots
     bytes_up_per_hour: float = 0.0
     bytes_down_per_hour: float = 0.0
-    client: ClientReport | None = None  # of the newest incarnation, if it is a client that reports
+    report: ClientReport | None = None  # the newest one of the newest incarnation
 
     @property
     def incarnation_number(self) -> int:
@@ -118,6 +124,16 @@ class Actor:
     def missed(self) -> int:
         """Number of rollouts that never arrived."""
         return min(self.missed_earlier + self.sequences.gaps, 2**53)
+
+    @property
+    def silence_limit(self) -> float:
+        """Seconds without a sign of life that are unusual for this actor."""
+        return max(_SILENCE_SECONDS, _SILENCE_TIMES * self.longest_silence)
+
+    def heard(self, now: float) -> None:
+        """Note a sign of life of the newest incarnation. `now` is on the monotonic clock, in seconds."""
+        self.longest_silence = max(now - self.last_seen, _REMEMBERED * self.longest_silence)
+        self.last_seen = now
 
     def count_unfit(self, violation: str) -> None:
         """Count a rollout that violates the specification. Quarantine the actor after three in a row.
@@ -152,10 +168,10 @@ class Actor:
         self.incarnations += 1
         self.uploads, self.rows, self.episode_rows = next_sequence, 0, 0
         self.consecutive_unfit = self.faults = self.good_in_a_row = 0
-        self.left = False
+        self.left, self.longest_silence = False, 0.0
         self.quarantined = self.drained_by = ""
         self.fetches = self.compact_snapshots = False
-        self.client = None
+        self.report = None
 
 
 _MAX_TOKENS = 8192  # tokens: twice the actors that one owner may have
@@ -393,12 +409,16 @@ class Fleet:
         self.changed()
         return None
 
-    def report(self, name: str, report: ClientReport) -> Refusal | None:
-        """Note what a client reports about itself. Return None, or a Refusal if it does not take part."""
+    def report(self, name: str, report: ClientReport, now: float) -> Refusal | None:
+        """Note what an actor reports about itself. Return None, or a Refusal if it does not take part.
+
+        `now` is on the monotonic clock, in seconds.
+        """
         actor = self.actors.get(name)
         if actor is None or (report.actor, report.incarnation) != (name, actor.incarnation):
             return Refusal(code="unknown", reason=f"this process of {name[:64]!r} has not joined")
-        actor.client = replace(report, safe_reason=bounded_text(report.safe_reason))
+        actor.report = replace(report, safe_reason=bounded_text(report.safe_reason))
+        actor.heard(now)
         return None
 
     def drain(self, name: str, author: str) -> Refusal | None:
@@ -524,6 +544,19 @@ class Fleet:
         if self._live is None:
             self._live = frozenset(actor.name for actor in self.actors.values() if self.is_live(actor))
         return self._live
+
+    def batch_seconds(self, rollouts: int, *, together: bool) -> float:
+        """Return how long the live actors take for a batch, in seconds, as far as they report it; else 0.
+
+        Args:
+          rollouts: number of rollouts in a batch.
+          together: whether a batch is one rollout of each actor.
+        """
+        reports = filter(None, (self.actors[name].report for name in self.live))
+        seconds = [each.rollout_seconds + each.waiting_seconds for each in reports if each.rollout_seconds > 0.0]
+        if together or not seconds:
+            return max(seconds, default=0.0)
+        return rollouts / sum(1.0 / each for each in seconds)
 
     def changed(self) -> None:
         """Note that the live actors may be others than before, for example after a quarantine."""

@@ -74,7 +74,7 @@ def page(fleet: Fleet, after: str, now: float) -> tuple[ActorStatus, ...]:
 
 
 def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
-    client = actor.client or ClientReport(actor=actor.name, incarnation=actor.incarnation)
+    report = actor.report or ClientReport(actor=actor.name, incarnation=actor.incarnation)
     return ActorStatus(
         actor=actor.name,
         host=actor.origin.host,
@@ -96,12 +96,17 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         compact_snapshots=actor.compact_snapshots,
         bytes_up_per_hour=actor.bytes_up_per_hour,
         bytes_down_per_hour=actor.bytes_down_per_hour,
-        deadlines=client.deadlines,
-        missed_deadlines=client.missed_deadlines,
-        overridden_actions=client.overridden_actions,
-        safe_actions=client.safe_actions,
-        rollouts_dropped=client.rollouts_dropped,
-        safe_reason=client.safe_reason,
+        deadlines=report.deadlines,
+        missed_deadlines=report.missed_deadlines,
+        overridden_actions=report.overridden_actions,
+        safe_actions=report.safe_actions,
+        rollouts_dropped=report.rollouts_dropped,
+        safe_reason=report.safe_reason,
+        rows=report.rows,
+        rollout_seconds=report.rollout_seconds,
+        waiting_seconds=report.waiting_seconds,
+        round_trip_seconds=report.round_trip_seconds,
+        silence_limit_seconds=actor.silence_limit,
         drained_by=actor.drained_by,
     )
 
@@ -182,13 +187,16 @@ class JoinResponses:
         )
         return encode(welcome)
 
-    def report(self, name: str, data: bytes) -> bytes:
-        """Return the answer to the encoded ClientReport of an actor. `name` is that in the key of the query."""
+    def report(self, name: str, data: bytes, now: float) -> bytes:
+        """Return the answer to the encoded ClientReport of an actor.
+
+        `name` is that in the key of the query, `now` the time on the monotonic clock, in seconds.
+        """
         message = read_request(data, CLIENT_REPORT_LIMITS, ClientReport)
         if isinstance(message, Refusal):
             return encode(message)
         with self._context.lock:
-            refusal = self._context.fleet.report(name, message)
+            refusal = self._context.fleet.report(name, message, now)
         return encode(refusal or Acknowledgement(verdict="accepted"))
 
     def _add_refusal(self, name: str, origin: Origin, refusal: Refusal) -> None:

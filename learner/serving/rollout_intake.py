@@ -309,7 +309,8 @@ class RolloutIntake:
         for name in sorted(self._buffer.left_out - self._named):
             self._named.add(name)
             _logger.warning(
-                "batches no longer wait for actor %r, which is connected but sends nothing: examine its environment",
+                "batches no longer wait for actor %r, which is connected but far slower than the others, or hung: "
+                "examine its environment",
                 name,
             )
         return taken
@@ -342,7 +343,9 @@ class RolloutIntake:
                 break
             arrived, request = taken
             sender, payload = keys.last_chunk(request.key), request.payload
+            began = time.monotonic()
             content = self._judge.read(sender, payload)
+            self._counters.decoding_seconds += time.monotonic() - began
             with self._lock:
                 too_fast = self._judge.is_too_fast(content, time.monotonic())
             if too_fast or not self._wait_for_room(content, arrived + LATE_SECONDS):

@@ -149,7 +149,7 @@ class RolloutJudge:
         verdict = content if isinstance(content, Rejected) else self._judge(sender, content, policy_version, now)
         actor = self._fleet.actors.get(sender)
         if actor is not None:
-            actor.last_seen = now
+            actor.heard(now)
             if isinstance(verdict, Rejected):
                 actor.rejected[verdict.cause] += 1
             else:

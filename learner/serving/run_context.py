@@ -20,7 +20,10 @@ from daedalus.protocol.spec import RunSpec
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
-_STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
+# Without an update for so long, or for so many batches, the service has a problem. What actors say of themselves counts
+# up to an hour.
+_STALLED_SECONDS, _STALLED_BATCHES, _MOST_EXPECTED_SECONDS = 60.0, 3.0, 3600.0
+_REMEMBERED = 0.8  # of the longest wait for a batch, at each batch
 _FAR_SECONDS = 60.0  # so long after a rollout far outside what others send, its sender is a problem
 SLOW_DISK_SECONDS = 10.0  # in which a disk has written a checkpoint, or a row of metrics
 _NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
@@ -33,6 +36,8 @@ class Health:
     started: float
     updated: float  # time of the last update, or the start
     actor_seen: float  # last time with a live actor, or the start
+    awaited_since: float = 0.0  # `updated`, or the last time without a live actor if that is later
+    batch_seconds: float = 0.0  # the longest of the last waits from one update to the next
     directory: str = ""  # of the run, as the problems name it
     saved: float | None = None  # time of the last checkpoint
     saving_since: float | None = None  # since when a checkpoint is being written, if one is
@@ -46,27 +51,54 @@ class Health:
     # Days until the certificate of this process expires, or None without one.
     certificate_days_left: Callable[[], float | None] = lambda: None
 
+    def __post_init__(self) -> None:
+        self.awaited_since = max(self.awaited_since, self.updated)
+
     def note_far_outside(self, components: Mapping[str, str], now: float) -> None:
         """Note actors whose rollouts were left out because numbers are far outside, and their components."""
         recent = {name: each for name, each in self.far_outside.items() if now - each[1] < _FAR_SECONDS}
         self.far_outside = recent | {name: (component, now) for name, component in components.items()}
 
-    def problems(self, now: float, live: int) -> tuple[str, ...]:
+    def note_update(self, now: float) -> None:
+        """Note that a batch was trained on."""
+        self.batch_seconds = max(now - self.awaited_since, _REMEMBERED * self.batch_seconds)
+        self.updated = self.actor_seen = self.awaited_since = now
+
+    def note_actors(self, live: int, now: float) -> None:
+        """Note how many actors are live."""
+        if live:
+            self.actor_seen = now
+        else:
+            self.awaited_since = now
+
+    def is_stalled(self, now: float, expected: float) -> bool:
+        """Return whether no update has come for much longer than usual.
+
+        Args:
+          now: time on the monotonic clock, in seconds.
+          expected: how long the live actors take for a batch, in seconds, as far as they say; else 0.
+        """
+        usual = max(self.batch_seconds, min(expected, _MOST_EXPECTED_SECONDS))
+        return now - self.awaited_since > max(_STALLED_SECONDS, _STALLED_BATCHES * usual)
+
+    def problems(self, now: float, live: int, expected: float = 0.0) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
 
         Args:
           now: time on the monotonic clock, in seconds.
           live: number of live actors.
+          expected: see `is_stalled`.
         """
         found = []
         if not live and now - self.actor_seen > _NO_ACTOR_SECONDS:
             found.append(f"no live actor for {now - self.actor_seen:.0f} s")
-        elif now - self.updated > _STALLED_SECONDS:
+        elif self.is_stalled(now, expected):
             found.append(f"no update for {now - self.updated:.0f} s")
         if self.left_out:
             names = sorted(self.left_out)
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            found.append(f"batches do not wait for {', '.join(names[:5])}{more}: connected, but without rollouts")
+            who = f"{', '.join(names[:5])}{more}"
+            found.append(f"batches do not wait for {who}: connected, but far slower than the others, or hung")
         far = {name: each for name, (each, last) in self.far_outside.items() if now - last < _FAR_SECONDS}
         if far:
             names = [f"{name} ({component})" for name, component in sorted(far.items())]
@@ -164,6 +196,11 @@ class RunContext:
     def progress(self) -> float:
         """Progress of the annealed settings, from 0 to 1."""
         return self.annealing.at(self.counters.env_steps)
+
+    @property
+    def expected_batch_seconds(self) -> float:
+        """How long the live actors take for a batch, in seconds, as far as they say; else 0. Needs the lock."""
+        return self.fleet.batch_seconds(self.spec.batch_rollouts, together=self.spec.algorithm.synchronous)
 
     @property
     def is_finished(self) -> bool:

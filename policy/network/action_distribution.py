@@ -70,6 +70,15 @@ class ActionDistribution(nn.Module):
         results = [part.log_prob_and_entropy(own, actions[name]) for name, part, own in parts]
         return _sum([log_prob for log_prob, _ in results]), _sum([entropy for _, entropy in results])
 
+    def entropy(self, parameters: Tensor, masks: Components) -> Tensor:
+        """Return H(pi(. | s)) [...], in nats; arguments as for `log_prob`."""
+        return _sum([part.entropy(own) for _, part, own in self._parts(parameters, masks)])
+
+    def probabilities(self, parameters: Tensor, masks: Components) -> Components:
+        """Return the probabilities of all choices [..., D, A] of each discrete action; arguments as for `log_prob`."""
+        parts = self._parts(parameters, masks)
+        return {name: part.probabilities(own) for name, part, own in parts if isinstance(part, Categorical)}
+
     def _parts(self, parameters: Tensor, masks: Components) -> list[tuple[str, Distribution, Tensor]]:
         """Return name, distribution and parameters of each component; illegal choices have probability 0."""
         owns = parameters.split(self._sizes, -1) if len(self._sizes) > 1 else (parameters,)

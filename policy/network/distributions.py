@@ -135,6 +135,10 @@ class Categorical(Distribution):
         log_probs = arranged.log_softmax(axis)
         return _chosen(log_probs, actions, axis), _categorical_entropy(log_probs, axis)
 
+    def probabilities(self, parameters: Tensor) -> Tensor:
+        """Return pi_d(a | s) [..., D, A], A being the largest number of choices; 0 where a variable has fewer."""
+        return self._log_probs(parameters).exp()
+
     def _log_probs(self, parameters: Tensor) -> Tensor:
         return self._by_variable(parameters).log_softmax(-1)  # [..., D, A]
 

@@ -216,6 +216,9 @@ def test_client_reports_what_it_counts(learner: ScriptedLearner) -> None:
         assert report == ClientReport(
             actor="robot",
             incarnation=report.incarnation,
+            rows=4,
+            rollout_seconds=report.rollout_seconds,
+            round_trip_seconds=report.round_trip_seconds,
             deadlines=2 + missed,
             missed_deadlines=missed,
             overridden_actions=1,

@@ -21,7 +21,7 @@ from daedalus.actor.session.conversation import (
 from daedalus.actor.session.session_engine import Collect, Load
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Acknowledgement, Join, RunEnded, SnapshotRequest, new_epoch
+from daedalus.protocol.messages import Acknowledgement, ClientReport, Join, RunEnded, SnapshotRequest, new_epoch
 
 
 def rollouts(played: PlayedSession) -> list[Query]:
@@ -138,6 +138,40 @@ def test_silent_learner_is_probed_and_joined_again_if_it_does_not_respond() -> N
     assert len(played.of(Collect)) == 2
 
 
+def test_actor_that_is_asked_to_leave_finishes_its_rollout_and_awaits_the_verdicts() -> None:
+    played = PlayedSession()
+    played.seconds[Collect] = 3.0
+    played.go(lambda: len(rollouts(played)) == 2)
+    played.event(played.session.leave, played.now + 30.0)
+    with pytest.raises(RunOverError, match=r"^asked by a signal to leave: no rollout is lost$") as over:
+        played.go(lambda: False)
+    assert not over.value.finished
+    assert len(played.of(Collect)) == len(rollouts(played)) <= 3  # none was begun since
+    played = PlayedSession()
+    played.verdict = None
+    played.go(lambda: len(rollouts(played)) == 2)
+    leave_by = played.now + 30.0
+    played.event(played.session.leave, leave_by)
+    with pytest.raises(RunOverError, match=r"leave: 2 uploaded rollouts had no verdict yet, and may be lost$"):
+        played.go(lambda: False)
+    assert played.now == pytest.approx(leave_by, abs=1.0)
+
+
+def test_actor_that_is_asked_to_leave_drops_a_rollout_that_takes_too_long_and_says_so() -> None:
+    played = PlayedSession()
+    played.go(lambda: bool(played.of(Collect)))
+    session = played.session
+    for _ in range(58):  # 57 rows, and another has begun
+        session.begin_row(played.now)
+    played.event(session.leave, played.now + 30.0)
+    played.event(session.check_over)
+    played.now += 24.9
+    played.event(session.check_over)
+    played.now += 0.2  # too late to upload what the next row completes
+    with pytest.raises(RunOverError, match=r"the rollout under way is lost \(57 rows in each environment\)$"):
+        played.event(session.check_over)
+
+
 def test_actor_that_is_drained_while_it_sends_nothing_ends() -> None:
     """Because it waits for the other actors of a2c."""
     played = PlayedSession()
@@ -227,3 +261,23 @@ def test_synchronous_actor_plays_each_version_once() -> None:
     played.version = 1
     played.go(lambda: len(rollouts(played)) == 2)  # its push was lost: it is requested after a second
     assert played.now == pytest.approx(began + 1.0, abs=0.1)
+
+
+def test_actor_reports_every_five_seconds_while_it_plays_or_waits() -> None:
+    played = PlayedSession()
+    played.go(lambda: bool(played.of(Collect)))
+    rows, length = 300, SPEC.collection.rollout_length
+    for _ in range(rows):  # 30 s of a slow environment
+        played.now += 0.1
+        due = played.session.begin_row(played.now)
+        played.event(played.session.act_in_rollout if due else played.session.check_over)
+    in_rollout = played.requests(ClientReport)
+    assert len(in_rollout) in (5, 6)
+    assert [report.rows for report in in_rollout] == sorted({report.rows for report in in_rollout})
+    assert in_rollout[-1].rollout_seconds == pytest.approx(0.1 * length, rel=0.01)
+    played.verdict = None  # the learner acknowledges nothing
+    began = len(in_rollout)
+    played.go(lambda: len(played.requests(ClientReport)) >= began + 4)
+    waiting = played.requests(ClientReport)[-2:]
+    assert waiting[1].rows == waiting[0].rows
+    assert waiting[1].waiting_seconds == pytest.approx(waiting[0].waiting_seconds + 5.0, abs=0.5)

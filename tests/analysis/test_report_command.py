@@ -102,10 +102,21 @@ def test_a_report_shows_evaluation_curves_settings_and_versions(folder: Path) ->
     assert "daedalus train run/config.toml" in text
 
 
+def test_the_return_is_first(folder: Path) -> None:
+    run = evaluated(record(folder / "run"))
+    assert report(["run"]) == 0
+    page = (run / "report.html").read_text()
+    sections = re.findall(r"<h2>([^<]*)</h2>", page)
+    assert sections[:3] == ["Return", "Evaluation", "Learning curves"]
+    assert (
+        page.index("return of the training episodes") < page.index("episodes by return") < page.index("entropy (nats)")
+    )
+
+
 def test_settings_that_are_the_defaults_are_collapsed(folder: Path) -> None:
     run = record(folder / "run", settings=["collection.window=7"])
     assert report(["run"]) == 0
-    chosen, others = (run / "report.html").read_text().split("settings with their default values")
+    chosen, others = (run / "report.html").read_text().split("settings at their defaults")
     shown, hidden = (
         re.findall(r'<th scope="row">(\w+)</th>', part) for part in (chosen, others.split("</details>")[0])
     )
@@ -115,12 +126,16 @@ def test_settings_that_are_the_defaults_are_collapsed(folder: Path) -> None:
     assert not {"id", "window"} & set(hidden)
 
 
-def test_commands_allow_the_modules_of_a_run(folder: Path) -> None:
+def test_commands_allow_the_modules_of_a_run_and_begin_with_its_weights(folder: Path) -> None:
     settings = ["environment.id=corridor:Corridor-v0", "policy.encoder=layers:Net"]
     run = record(folder / "run", settings=settings, evaluation=None, finished=False)
+    versions = json.loads((run / "versions.json").read_text())
+    origin = {"init_from": "/runs/first one", "init_from_other_spaces": True}
+    (run / "versions.json").write_text(json.dumps({**versions, **origin}))
     assert report(["run"]) == 0
     text = Page(run / "report.html").text
-    assert "daedalus train run/config.toml\ndaedalus evaluate run --allow-module corridor made" in text
+    train = "daedalus train run/config.toml --init-from '/runs/first one' --allow-other-spaces"
+    assert f"{train}\ndaedalus evaluate run --allow-module corridor The run has code" in text
     assert "daedalus evaluate run --allow-module corridor --record" in text
     assert "continue it with: daedalus resume run --allow-module corridor --allow-module layers" in text
 
@@ -372,7 +387,7 @@ def test_runs_of_several_environments_have_tables_and_charts_of_their_own(folder
     assert report(["runs"]) == 0
     text = " ".join(Page(folder / "report.html").text.split())
     assert "3 runs of 2 environments" in text
-    acrobot, cartpole = text.index("Acrobot-v1 Comparison"), text.index("CartPole-v1 Comparison")
+    acrobot, cartpole = text.index("Acrobot-v1 Return"), text.index("CartPole-v1 Return")
     assert acrobot < text.index("c 1 490", acrobot) < cartpole < text.index("CartPole-v1, impala 2 490", cartpole)
     html = (folder / "report.html").read_text()
     assert html.count(">return of the training episodes<") == 2

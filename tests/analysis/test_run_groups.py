@@ -6,7 +6,8 @@ from recorded_runs import record
 
 from daedalus.analysis.comparison import as_text, compare_groups
 from daedalus.analysis.recorded_run import RecordedRun, read_run
-from daedalus.analysis.run_groups import by_settings, by_user, environment_of, select, text
+from daedalus.analysis.run_groups import by_settings, by_user, environment_of, select
+from daedalus.learner.run.settings import value_text
 
 
 def run(folder: Path, name: str, *settings: str, seed: int = 1, preset: str = "cartpole") -> RecordedRun:
@@ -135,4 +136,4 @@ def test_groups_of_the_user_are_compared_within_each_environment(tmp_path: Path)
 
 def test_values_are_short_texts() -> None:
     values = [1, True, 0.0003, 1e-10, [64, 64], None, "tanh"]
-    assert [text(value) for value in values] == ["1", "true", "0.0003", "1e-10", "[64,64]", "unset", "tanh"]
+    assert [value_text(value) for value in values] == ["1", "true", "0.0003", "1e-10", "[64,64]", "unset", "tanh"]

@@ -8,10 +8,11 @@ import stat
 from pathlib import Path
 
 import pytest
+from certificates import change_certificates
 
 from daedalus.cli.commands.certs import certs
 from daedalus.launch import certificates
-from daedalus.transport.credentials import authorised_names, load
+from daedalus.transport.credentials import authorised_clients, load
 
 
 def make(directory: Path) -> Path:
@@ -41,13 +42,13 @@ def test_issue_and_revoke_update_the_authorised_clients_of_learner_and_router(tm
     credentials = load(made / "actor-arm", "actor")
     assert (credentials.role, credentials.name) == ("actor", "arm")
     for role in ("learner", "router"):
-        assert authorised_names(made / role) == {"actors": ["arm", "box"], "operators": ["ann", "operator"]}
+        assert authorised_clients(made / role) == ["actor:arm", "actor:box", "operator:ann", "operator:operator"]
     zenohd = json.loads((made / "router" / "zenoh.json5").read_text())
     assert {"actor:arm", "actor:box"} < {
         name for subject in zenohd["access_control"]["subjects"] for name in subject.get("cert_common_names", ())
     }
     assert certs(["revoke", "actor", "box", "--directory", str(made)]) == 0
-    assert authorised_names(made / "learner")["actors"] == ["arm"]
+    assert "actor:arm" in authorised_clients(made / "learner")
     assert not (made / "actor-box").exists()
 
 
@@ -60,7 +61,7 @@ def test_issue_that_was_interrupted_succeeds_when_it_is_repeated(
         assert certs(["issue", "actor", "arm-1", "--directory", str(folder)]) == 1
     assert (folder / "ca" / "actor-arm-1").exists()
     assert certs(["issue", "actor", "arm-1", "--directory", str(folder)]) == 0, capsys.readouterr().err
-    assert authorised_names(folder / "learner")["actors"] == ["arm-1"]
+    assert "actor:arm-1" in authorised_clients(folder / "learner")
 
 
 def _disk_full(_key: object) -> bytes:
@@ -144,7 +145,7 @@ def test_more_certificates_than_a_handshake_has_room_for_are_refused(
     assert certs(["issue", "actor", "box", "--directory", str(made)]) == 1
     assert not (made / "actor-box").exists()
     assert "3 certificates are more than a listener can accept: issue one for each host" in capsys.readouterr().err
-    assert authorised_names(made / "learner")["actors"] == ["arm"]
+    assert "actor:arm" in authorised_clients(made / "learner")
 
 
 @pytest.mark.parametrize(
@@ -152,7 +153,7 @@ def test_more_certificates_than_a_handshake_has_room_for_are_refused(
     [
         (["init", "{certs}"], "is not empty"),
         (["issue", "actor", "--directory", "{certs}"], "wrong number of names"),
-        (["issue", "learner", "x", "--directory", "{certs}"], "wrong number of names"),
+        (["issue", "router", "x", "--directory", "{certs}"], "wrong number of names"),
         (["issue", "actor", "a.b", "--directory", "{certs}"], "'a.b' has a '.': name it 'a'"),
         (["issue", "actor", "a/b", "--directory", "{certs}"], "actor name 'a/b' must be"),
         (["issue", "actor", "a", "--directory", "{certs}/nowhere"], "holds no CA"),
@@ -174,3 +175,27 @@ def test_a_mistake_is_reported_in_one_line_and_changes_no_file(
     assert message in error
     assert error.count("\n") == 1
     assert sorted(made.rglob("*")) == before
+
+
+def test_certificates_of_one_run_keep_their_run_and_have_no_token_for_gateways(tmp_path: Path) -> None:
+    made = make(tmp_path / "certs")
+    change_certificates(made, "issue learner alice")
+    change_certificates(made, "issue actor rob --run alice")
+    change_certificates(made, "issue operator ann --run alice")
+    scoped = {"actor:rob@alice", "learner:alice", "operator:ann@alice"}
+    assert scoped <= set(authorised_clients(made / "router"))
+    assert [load(made / f"{role}-{name}", role).run for role, name in (("actor", "rob"), ("learner", "alice"))] == [
+        "alice",
+        "alice",
+    ]
+    assert not (made / "operator-ann" / "token").exists()
+    change_certificates(made, "issue actor rob")  # a new one, for the same run
+    change_certificates(made, "renew actor")
+    change_certificates(made, "renew operator ann")
+    assert scoped <= set(authorised_clients(made / "router"))
+    assert not (made / "operator-ann" / "token").exists()
+    change_certificates(made, "issue actor rob --run bob")
+    change_certificates(made, "revoke learner alice")
+    assert scoped & set(authorised_clients(made / "router")) == {"operator:ann@alice"}
+    assert certs(["issue", "client", "c", "--run", "alice", "--directory", str(made)]) == 1
+    assert certs(["issue", "actor", "a" * 40, "--run", "b" * 40, "--directory", str(made)]) == 1

@@ -47,12 +47,9 @@ def test_a_curve_spans_the_values(values: list[float], width: int, shown: str) -
     assert sparkline(values, width, ASCII).isascii()
 
 
-def test_a_run_keeps_the_returns_of_all_rows_and_measures_its_rate() -> None:
-    run = WatchedRun(run_status(uptime_seconds=10.0, env_steps=100))
-    run.add_status(run_status(uptime_seconds=10.0, env_steps=100))
-    assert run.rate == 20.0  # the learner's own
-    run.add_status(run_status(uptime_seconds=20.0, env_steps=400))
-    assert run.rate == 30.0
+def test_a_run_keeps_the_returns_of_all_rows_and_knows_its_end() -> None:
+    run = WatchedRun(run_status(env_steps=100))
+    run.add_status(run_status(env_steps=400, env_steps_per_second=30.0))
     assert run.seconds_left == 20.0
     page = MetricsPage(run="mine", learner_epoch=1, columns=("env_steps", "episode_return_mean"))
     values = np.array([[1.0, np.nan], [2.0, 5.0], [3.0, 6.0]])

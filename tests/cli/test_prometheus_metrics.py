@@ -65,10 +65,10 @@ def test_an_unknown_value_has_no_sample() -> None:
 
 def test_the_certificate_of_a_learner_is_exported_after_the_learner_has_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     """A learner ends when its certificate expires: the gauge then goes below 0, and disappears a week later."""
-    days, now = CertificateDays([], None), time.time()
+    days, now = CertificateDays([], None), time.monotonic()
 
     def seen(days_later: float, *statuses: RunStatus) -> dict[str, float]:
-        monkeypatch.setattr(time, "time", lambda: now + days_later * 86_400)
+        monkeypatch.setattr(time, "monotonic", lambda: now + days_later * 86_400)
         return {sample.labels["run"]: round(sample.value, 3) for sample in days.metric(statuses).samples}
 
     assert seen(0.0, run_status(certificate_days_left=None)) == {}

@@ -1,10 +1,6 @@
 """cli/commands/train.py: the last lines of `daedalus train`."""
 
-import importlib.util
-import time
 from pathlib import Path
-
-import pytest
 
 from daedalus.cli.commands.train import report
 from daedalus.launch.local_run import LocalRun
@@ -27,23 +23,10 @@ SUMMARY = {
 }
 
 
-@pytest.mark.parametrize("installed", [True, False])
-def test_plot_command_is_suggested_only_where_matplotlib_is_installed(
-    installed: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
-    spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
-    text = report(LocalRun(directory=Path("runs/one"), spec=spec, started=time.monotonic()), SUMMARY)
-    assert "episodes of the newest checkpoint on CartPole-v1 (backend gymnasium)\n7 of 9 episodes were cut\nrun" in text
-    assert "run directory: runs/one" in text
-    assert ("daedalus plot runs/one" in text) == installed
-
-
-def test_plot_command_can_be_typed_also_with_special_characters_in_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: object())
-    spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
-    text = report(LocalRun(directory=Path("runs/one;two"), spec=spec, started=time.monotonic()), SUMMARY)
-    assert text.endswith("daedalus plot 'runs/one;two' --output curve.png")
+def test_notes_of_the_evaluation_are_printed() -> None:
+    run = LocalRun(directory=Path("runs/one"), spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1")), started=0.0)
+    end = "episodes of the newest checkpoint on CartPole-v1 (backend gymnasium)\n7 of 9 episodes were cut"
+    assert report(run, SUMMARY).endswith(end)
 
 
 def test_skipped_updates_are_counted() -> None:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 from building import EPOCH, SPACES, run_context
+from prometheus_client import CollectorRegistry, generate_latest
 from statuses import actor_status, run_status
 
 from daedalus.cli.commands.status import status as status_command
@@ -23,9 +24,11 @@ from daedalus.protocol.limits import STATUS_LIMITS, STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import (
     MAX_EVENTS,
     PAGE_ACTORS,
+    Acknowledgement,
     ActorsPage,
     ActorsReport,
     ActorsRequest,
+    ActorStatus,
     Event,
     EventsPage,
     EventsReport,
@@ -301,6 +304,61 @@ def test_of_two_learners_of_a_run_both_are_shown_and_the_newer_is_named(
     monkeypatch.setattr("daedalus.cli.commands.status.connect_once", lambda *_: operator)
     assert status_command(["--connect", "tcp/127.0.0.1:1", "--quiet"]) == 3
     assert "mine: the learner with epoch 1f is not the newest" in capsys.readouterr().out
+
+
+def of_another_version() -> bytes:
+    answer = bytearray(encode(Refusal(code="unknown", reason="")))
+    answer[4] += 1
+    return bytes(answer)
+
+
+def crowded(*actors: ActorStatus) -> bytes:
+    """Return a status whose further actors are on pages of their own."""
+    status = run_status(run="other", learner_epoch=7, actors=actors)
+    return encode(StatusReport(status=status.model_copy(update={"actors_alive": 200})))
+
+
+TWINS = ActorsPage(learner_epoch=7, actors=(actor_status("x"), actor_status("y")) * 2)
+OTHERS = {
+    "another version": (of_another_version(), b"", "run 'other' is left out: its learner is of another release"),
+    "no message": (b"garbage", b"", "run 'other' is left out: what answers for its learner is not one"),
+    "another message": (encode(Acknowledgement(verdict="accepted")), b"", "find out which process serves"),
+    "pages of another version": (crowded(actor_status("x")), of_another_version(), "run 'other' is shown in part"),
+    "actors twice": (crowded(actor_status("x"), actor_status("x")), encode(ActorsReport(page=TWINS)), ""),
+}
+
+
+@pytest.mark.parametrize(("answer", "page", "said"), OTHERS.values(), ids=OTHERS)
+def test_another_release_hides_no_run_and_is_named(
+    operator: MemoryTransport,
+    answer: bytes,
+    page: bytes,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    foreign, ours = MemoryTransport(operator._network), MemoryTransport(operator._network)
+    foreign.serve(keys.status("other"), lambda request: request.reply(page if request.size else answer))
+    report = encode(StatusReport(status=run_status(actors=(actor_status("a"),))))
+    ours.serve(keys.status("mine"), lambda request: request.reply(report))
+    registry, collector = CollectorRegistry(), StatusCollector()
+    collector.transport = operator
+    registry.register(collector)
+    scraped = generate_latest(registry).decode()
+    lines = [line for line in scraped.splitlines() if not line.startswith("#")]
+    assert len(lines) == len(
+        {line.rpartition(" ")[0] for line in lines}
+    )  # Prometheus refuses a series that is there twice
+    assert "daedalus_up 1.0" in lines
+    assert 'daedalus_healthy{run="mine"} 1.0' in lines
+    assert ('daedalus_unreadable{run="other"} 1.0' in lines) == ("left out" in said or "find out" in said)
+    assert said in caplog.text
+    monkeypatch.setattr("daedalus.cli.commands.status.connect_once", lambda *_: operator)
+    assert status_command(["--connect", "tcp/127.0.0.1:1"]) == 0
+    shown = capsys.readouterr()
+    assert "run mine: CartPole-v1" in shown.out
+    assert said in shown.err + caplog.text
 
 
 def test_only_answers_of_another_release_are_an_error(operator: MemoryTransport) -> None:

@@ -47,7 +47,9 @@ def test_the_systemd_units_restart_what_has_not_finished() -> None:
     assert service["RestartPreventExitStatus"] == f"{BAD_USAGE} {SUPERSEDED}"
     assert actor["RestartPreventExitStatus"] == str(BAD_USAGE)
     assert actor["ExecStart"] == f"{service['ExecStart']} --stay"  # a drained actor, which ends with 0, stays away
+    assert (actor["KillSignal"], actor["KillMode"]) == ("SIGUSR1", "mixed")  # to the actor alone, not its environments
     own = {"ExecStart", "RestartPreventExitStatus", "SuccessExitStatus", "TimeoutStopSec", "Environment"}
+    own |= {"KillSignal", "KillMode"}
     assert {name: value for name, value in service.items() if name not in own} == {
         name: value for name, value in actor.items() if name not in own
     }

@@ -93,6 +93,10 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
     status.wait()
     (line,) = status.lines
     assert json.loads(line)["actors_alive"] == 2
+    for actor in actors:
+        os.kill(actor.process.pid, signal.SIGUSR1)  # as their hosts do that end
+        assert actor.wait() == 0, actor.output
+        actor.expect("asked by a signal to leave: no rollout is lost")
     again = start(*learner, "one/sb", *often)  # as by a supervisor
     assert again.wait() == 7
     again.expect(r"one/sb: a newer learner of this run \(epoch [0-9a-f]+\) took over: .* remove \S*one/sb/summary.json")
@@ -118,3 +122,5 @@ def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release
         assert second.wait() == 3, second.output
         actor.expect("waiting for the next run")
         assert actor.process.poll() is None
+        os.kill(actor.process.pid, signal.SIGUSR1)
+        assert actor.wait() == 0, actor.output

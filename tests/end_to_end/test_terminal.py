@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 import threading
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -118,8 +119,24 @@ def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
     frame = next(number for number, line in enumerate(running.terminal.lines) if line.startswith("CartPole-v1, impala"))
     assert running.terminal.lines[frame + 2].startswith("return ")
     assert "stopped; checkpoint saved at" in "".join(running.terminal.lines[:frame])  # a long line goes on below
-    assert "".join(running.terminal.lines[frame + 5 :]) == "stopped; continue with: daedalus resume shown-run"
+    left, how = "report: shown-run/report.html", "stopped; continue with: daedalus resume shown-run"
+    assert "".join(running.terminal.lines[frame + 5 :]) == left + how
+    assert (tmp_path / "shown-run" / "report.html").exists()
     assert not processes_mentioning("shown-run")
+
+
+def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Callable[..., AtTerminal]) -> None:
+    short = ("--env-steps", "20000", "--set", "evaluation.final_episodes=3", "--actors", "1")
+    running = at_terminal("train", "cartpole", "--watch", "--run-dir", "kept-run", *short)
+    until(lambda: running.fault or "press Ctrl-C to close it" in running.text.replace("\n", ""))
+    assert "report: kept-run/report.html" in running.text
+    port = re.search(r"http://127\.0\.0\.1:(\d+)/", running.raw.decode())
+    assert port is not None
+    with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/", timeout=LIMIT) as answer:
+        assert answer.status == 200
+    running.type(b"\x03")
+    assert running.wait() == 3  # that of the run
+    assert not processes_mentioning("kept-run")
 
 
 def test_train_on_a_dumb_terminal_prints_plain_lines(at_terminal: Callable[..., AtTerminal]) -> None:

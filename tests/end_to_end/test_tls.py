@@ -95,3 +95,23 @@ def test_mistakes_with_certificates_are_reported_in_one_line(
         failed.expect(message)
         assert "Traceback" not in failed.output
     assert learner.process.poll() is None
+
+
+def test_users_of_one_router_are_kept_apart(start: Start, tls: str, tmp_path: Path) -> None:
+    words = ("learner alice bob", "actor arm --run alice", "operator ann --run alice", "operator ben --run bob")
+    folder = make_certificates(tmp_path / "certs", *words)
+    start("router", "--listen", tls, "--tls", folder / "router").expect("listening")
+    to = ("--connect", tls, "--tls")
+    refused = start("learner", "cartpole", "--run-dir", "bob", *to, folder / "learner-alice")
+    assert refused.wait() == 2
+    refused.expect("is not for the run 'bob', only for 'alice'")
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    learner = start("learner", "cartpole", "--run-dir", "alice", *endless, *to, folder / "learner-alice")
+    start("actor", *to, folder / "actor-arm").expect("joined run 'alice'")
+    learner.expect("actors 1")
+    until(lambda: start("status", "--quiet", *to, folder / "operator-ann").wait() == 0)
+    assert start("status", *to, folder / "operator-ben").wait() == 1
+    assert start("stop", "alice", *to, folder / "operator-ben").wait() == 2
+    assert learner.process.poll() is None
+    assert start("stop", "alice", *to, folder / "operator-ann").wait() == 0
+    assert learner.wait() == 0, learner.output

@@ -125,6 +125,7 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
         "checkpoints",
         "summary.json",
         "evaluation.json",
+        "report.html",
     }
     rows = metrics(directory)
     assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
@@ -263,7 +264,7 @@ def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: St
     }
     plain = [line for line in running.lines if not line.startswith("{")]
     assert not {record["message"] for record in records} & set(plain)
-    *progress, outcome, evaluation, folder = plain
+    *progress, outcome, evaluation, left = plain
     assert all(re.search(r"return .* env_steps .* actors \d+$", line) for line in progress), running.output
     assert (outcome.split(":")[0] in ("solved", "done"), evaluation.split(":")[0]) == (True, "evaluation")
-    assert folder.startswith("run directory: run;")
+    assert left == "report: run/report.html"

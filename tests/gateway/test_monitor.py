@@ -8,7 +8,7 @@ from watched import FakeSource, actor_status, run_status
 
 from daedalus.gateway.watching import monitor as monitor_module
 from daedalus.gateway.watching.monitor import RunMonitor
-from daedalus.gateway.watching.page_data import Observation
+from daedalus.gateway.watching.page_data import FolderView, Observation
 from daedalus.protocol.messages import Event
 
 
@@ -17,7 +17,8 @@ class Watched:
 
     def __init__(self) -> None:
         self.source, self.seen, self.end = FakeSource(), list[Observation](), ""
-        self.monitor = RunMonitor(self.source, self.seen.append, lambda: self.end)
+        self.folder: FolderView | None = None
+        self.monitor = RunMonitor(self.source, self.seen.append, lambda: self.end, lambda run: self.folder)
 
     def until_state(self, state: str) -> Observation:
         until(lambda: self.seen and self.seen[-1].state == state)
@@ -50,6 +51,20 @@ def test_a_run_comes_is_lost_returns_and_ends(watched: Watched) -> None:
     assert ended.status is not None  # the result
     watched.end, watched.source.answer = "", run_status(learner_epoch=2)
     watched.until_state("running")
+
+
+def test_a_run_whose_learner_has_ended_is_stopped_by_its_directory(watched: Watched) -> None:
+    watched.source.answer = run_status()
+    watched.until_state("running")
+    watched.source.answer = None
+    watched.until_state("lost")
+    watched.folder = FolderView(settings=(), output="", ends=("Continue it with: daedalus resume r",), stopped=True)
+    assert watched.until_state("stopped").folder == watched.folder
+    watched.source.answer = run_status()
+    watched.until_state("running")
+    watched.monitor.close()
+    watched.folder = FolderView(settings=(), output="", ends=("Report: r/report.html",))
+    assert watched.monitor.last_look().state == "ended"  # what the learner could not say any more
 
 
 def test_all_pages_of_the_metrics_are_read_and_then_only_new_rows(watched: Watched) -> None:

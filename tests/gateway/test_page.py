@@ -1,11 +1,13 @@
 """The page in a real browser: of a real run, and of runs that no test can wait for."""
 
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from watched import HOSTILE, actor_status, observed, run_status
 
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import OperatorToken
+from daedalus.gateway.watching.page_data import FolderView
 from daedalus.protocol.messages import Event, Order
 from daedalus.transport.connecting import connect
 from daedalus.transport.memory import MemoryNetwork
@@ -26,6 +29,9 @@ from daedalus.transport.status_query import ask
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Debian's chromium")
 MILLISECONDS = 1000 * LIMIT
+FOLDER = FolderView(
+    settings=(("environment.id", HOSTILE, True), ("training.discount_factor", "0.99", False)), output=HOSTILE
+)
 TOKEN = "an operator's token of some length"
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 Open = Callable[..., Visit]
@@ -169,8 +175,10 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     page.get_by_role("button", name="Stop the run").click()
     page.get_by_role("dialog").get_by_role("button", name="Stop the run").click()
     assert process.wait() == 1, process.output
-    assert "stopped; continue with: daedalus resume run" in process.output
-    wait_for(page, "['lost', 'closed', 'ended'].includes(document.querySelector('#state').dataset.state)")
+    assert "; continue with: daedalus resume run" in process.output
+    page.wait_for_selector("#notices:has-text('The gateway has ended, too')")
+    assert page.locator("#state").get_attribute("data-state") == "stopped"
+    assert "Continue it with: daedalus resume run" in text_of(page, "#notices")
 
 
 # --------------------------------------------------------------------------------------- runs made for the page
@@ -194,9 +202,65 @@ def test_a_page_before_the_learner_and_after_the_end_says_so(gateway: RunningGat
     page.wait_for_selector("#notices:has-text('has not reached its network yet')")
     gateway.call(lambda: gateway.data.show(gateway.data.seen.__class__(state="waiting")))
     page.wait_for_selector("#notices:has-text('No learner has answered yet')")
-    show(gateway, run_status(), state="ended", reason="the run is over: the learner has finished")
+    folder = replace(FOLDER, ends=("Report: runs/r/report.html",))
+    show(gateway, run_status(), state="ended", reason="the run is over: the learner has finished", folder=folder)
     page.wait_for_selector("#notices:has-text('The run has ended: the run is over')")
     assert "return 12.5 after 100 env_steps" in text_of(page, "#notices")
+    assert "Report: runs/r/report.html" in text_of(page, "#notices")
+
+
+def test_the_camera_is_second_and_settings_that_differ_are_first(
+    network: MemoryNetwork, gateway: RunningGateway, visit: Open, tmp_path: Path
+) -> None:
+    (tmp_path / "token").write_text(TOKEN)
+    with closing(RunningGateway(network, follows=False, operator=OperatorToken(tmp_path / "token"))) as guarded:
+        show(guarded, run_status(), folder=FOLDER)
+        visited = visit(f"http://127.0.0.1:{guarded.port}/")
+        page, visited.loses_gateway = enter(visited.page, TOKEN), True
+        page.wait_for_selector("#changed tr")
+        order = page.evaluate("[...document.querySelectorAll('main > section')].map((each) => each.id)")
+        assert order[:4] == ["summary", "learning", "camera", "metrics"]
+        for selector in ("#changed", "#output"):
+            assert HOSTILE in text_of(page, selector)
+        assert page.locator("img").count() == 0
+        assert page.locator("#unchanged td").is_hidden()
+        page.locator("#unchanged-title").click()
+        assert text_of(page, "#unchanged td") == "0.99"
+        page.close()
+    show(gateway, run_status(), folder=FOLDER)
+    page = visit(f"http://127.0.0.1:{gateway.port}/").page
+    page.wait_for_selector("#output-note:has-text('holders of a token')")
+    assert HOSTILE not in text_of(page, "main")
+
+
+def test_curves_are_smoothed_zoomed_added_and_removed(gateway: RunningGateway, visit: Open) -> None:
+    rows = [
+        {"env_steps": 10.0 * step, "episode_return_mean": float(step % 2), "a": 1.0, "b": 2.0} for step in range(101)
+    ]
+    show(gateway, run_status(), rows)
+    page = visit(f"http://127.0.0.1:{gateway.port}/").page
+    page.wait_for_selector("#return .line")
+    label = page.locator("#return svg")
+    assert label.get_attribute("aria-label") == "Return: 0 at the end, from 0 to 1,000"
+    page.locator("#smoothing").select_option("20 rows")
+    assert label.get_attribute("aria-label") == "Return: 0.5 at the end, from 0 to 1,000"
+    page.locator("#part").select_option("last half")
+    assert label.get_attribute("aria-label") == "Return: 0.5 at the end, from 500 to 1,000"
+    page.locator("#part").select_option("whole run")
+    box = label.bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 50)
+    page.mouse.up()
+    assert page.locator("#part").input_value() == "as chosen"
+    first, last = map(int, re.findall(r"from (\d+) to (\d+)", label.get_attribute("aria-label"))[0])
+    assert 400 < first < 550 < last < 800
+    for name in ("a", "b"):
+        page.locator("#further").select_option(name)
+    assert page.locator("#charts h3").all_inner_texts()[-2:] == ["a", "b"]
+    page.get_by_role("button", name="Remove a").click()
+    assert page.locator("#charts h3").all_inner_texts()[-1] == "b"
+    assert page.locator("#further option").all_inner_texts() == ["choose", "a", "env_steps"]
 
 
 def test_an_order_that_the_gateway_does_not_receive_or_answer_is_reported(
@@ -245,6 +309,7 @@ def test_play_takes_no_part_in_a_run_of_another_environment(network: MemoryNetwo
     try:
         page = visit(f"http://127.0.0.1:{running.port}/play").page
         page.wait_for_selector("#status:has-text('Not playing: the run plays Other-v0')", timeout=MILLISECONDS)
+        assert "daedalus train cartpole --watch --clients" in text_of(page, "#elsewhere")
         assert text_of(page, "#steps") == "0"
     finally:
         running.close()
@@ -305,8 +370,8 @@ def test_page_is_accessible_and_fits(gateway: RunningGateway, visit: Open, schem
     actors = (actor_status("wing-1", compact_snapshots=True), quarantined, actor_status("wing-3", alive=False))
     rows = [{"env_steps": 100.0 * step, "episode_return_mean": 1.0 * step, "entropy": 0.5} for step in range(20)]
     event = Event(time="2026-11-22T13:16:45.123Z", kind="left", actor="wing-3", text="no longer connected", count=1)
-    show(gateway, run_status(actors, problems=("no update for 61 s",)), rows, events=(event,))
-    for path, selector in (("", "#charts .line"), ("play", "#status")):
+    show(gateway, run_status(actors, problems=("no update for 61 s",)), rows, events=(event,), folder=FOLDER)
+    for path, selector in (("", "#return .line"), ("play", "#status")):
         options = {"color_scheme": scheme, "viewport": {"width": width, "height": 800}}
         one = visit(f"http://127.0.0.1:{gateway.port}/{path}", **options)
         one.page.wait_for_selector(selector)

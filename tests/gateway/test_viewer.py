@@ -1,5 +1,6 @@
 """The page's WebSocket and files: what a viewer receives, who may watch and give orders, and bad input."""
 
+import asyncio
 import json
 import re
 import ssl
@@ -24,7 +25,7 @@ from websockets.sync.client import ClientConnection, connect
 from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import TOKENS, OperatorToken, Tokens, digest
-from daedalus.gateway.watching.page_data import OtherRun
+from daedalus.gateway.watching.page_data import FolderView, OtherRun
 from daedalus.transport.memory import MemoryNetwork
 
 TOKEN = "an operator's token of some length"
@@ -102,7 +103,7 @@ def _lowered(headers: Message) -> dict[str, str]:
 def test_a_page_that_is_opened_before_there_is_a_learner_says_so(watch: Watch) -> None:
     viewer = watch()
     assert viewer.receive("hello") == {"type": "hello", "orders": True, "camera": False, "clients": True}
-    assert viewer.receive("run") == {"type": "run", "state": "connecting", "reason": "", "status": None}
+    assert viewer.receive("run") == {"type": "run", "state": "connecting", "reason": "", "ends": [], "status": None}
     # A page that was connected before may still show the actors and curves of another run.
     assert viewer.receive("actors")["rows"] == []
     assert viewer.receive("events")["events"] == []
@@ -141,6 +142,32 @@ def test_later_messages_have_what_has_changed(gateway: RunningGateway, watch: Wa
     }
     show(gateway, run_status(), [{"env_steps": 1.0}], generation=1)
     assert viewer.receive("metrics")["reset"]
+
+
+def test_only_the_holder_of_a_token_reads_the_run_directory(
+    network: MemoryNetwork, gateway: RunningGateway, watch: Watch
+) -> None:
+    folder = FolderView(settings=(("a.b", "1", True),), output="[actor-0] hello")
+    show(gateway, run_status(), folder=folder)
+    received = watch().receive("folder")
+    assert (received["settings"], received["output"]) == ([["a.b", "1", True]], "[actor-0] hello")
+    with closing(RunningGateway(network, follows=False)) as openly:
+        show(openly, run_status(), folder=folder)
+        with connect(f"ws://127.0.0.1:{openly.port}/watch", open_timeout=LIMIT) as socket:
+            viewer = Viewer(socket)
+            viewer.send(type="hello", token="")
+            assert viewer.receive("folder") == {"type": "folder", "settings": None, "output": None}
+
+
+def test_an_open_page_receives_the_last_state_before_the_gateway_ends(gateway: RunningGateway, watch: Watch) -> None:
+    show(gateway, run_status())
+    viewer = watch()
+    viewer.receive("metrics")
+    folder = FolderView(settings=(), output="", ends=("Report: r/report.html",))
+    last = observed(run_status(), state="ended", folder=folder)
+    asyncio.run_coroutine_threadsafe(gateway.data.close(last), gateway.loop).result(LIMIT)
+    message = viewer.receive("run")
+    assert (message["state"], message["ends"]) == ("ended", ["Report: r/report.html"])
 
 
 def test_numbers_that_json_does_not_have_are_null(gateway: RunningGateway, watch: Watch) -> None:

@@ -56,7 +56,7 @@ class Run:
     @property
     def problems(self) -> tuple[str, ...]:
         """What the status reports, far in the future."""
-        self.state.health.updated = self.state.health.actor_seen = 1e9
+        self.state.health.note_update(1e9)
         return self.state.health.problems(1e9, 1)
 
     @property

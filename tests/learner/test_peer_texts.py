@@ -62,7 +62,7 @@ def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
     for name in names:
         join = Join(actor=name, incarnation=1, spaces=SPACES, environments=ENVIRONMENTS, origin=ORIGIN)
         responses.join(name, encode(join), 0.0)
-        responses.report(name, encode(ClientReport(actor=name, incarnation=1, safe_reason=FACE * 300)))
+        responses.report(name, encode(ClientReport(actor=name, incarnation=1, safe_reason=FACE * 300)), 1.0)
         quarantine(fleet, name, FACE * 3000)
         fleet.actors[name].rejected.update(dict.fromkeys(CAUSES, 2**40))
     for number in range(40):
@@ -99,7 +99,7 @@ def test_a_refusal_that_names_a_peer_is_small(name: str) -> None:
         responses.join(name, encode(Join(actor=name, incarnation=1)), 0.0),
         responses.join(name, encode(Join(actor="a", incarnation=1)), 0.0),
         responses.join("a", encode(Join(actor=name, incarnation=1)), 0.0),
-        responses.report(name, encode(ClientReport(actor="a", incarnation=1))),
+        responses.report(name, encode(ClientReport(actor="a", incarnation=1)), 1.0),
         SnapshotPublisher(context, MemoryTransport(MemoryNetwork())).program(name),
     ):
         refusal = decode(answer, Limits(max_header_bytes=2048))

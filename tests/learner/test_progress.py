@@ -119,6 +119,17 @@ def test_rates_are_unknown_before_the_first_batch(screen: Screen) -> None:
         assert part in screen.getvalue()
 
 
+def test_what_the_first_batch_waits_for_stands_in_place_of_figures(screen: Screen) -> None:
+    waits_for = "the first batch waits for rollouts: actor-0 is at row 34 of 128"
+    Progress(screen, 1000).show({"wall_seconds": 2.0, "env_steps": 0, "actors": 2}, waits_for)
+    assert screen.getvalue().endswith(f"    2.0 s  {waits_for}  actors 2")
+
+
+def test_lag_is_shown_in_batches_where_a_batch_makes_several_updates(screen: Screen) -> None:
+    Progress(screen, 1000, 160).show(row(100, policy_lag_mean=160.0))
+    assert "lag 1 batch (160 updates)" in screen.getvalue()
+
+
 @pytest.mark.parametrize("columns", [20, 60, 80, 100, 200])
 def test_line_fits_the_terminal(columns: int, screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
@@ -129,11 +140,8 @@ def test_line_fits_the_terminal(columns: int, screen: Screen, monkeypatch: pytes
         assert (part in line) == (columns >= needed), part
 
 
-def test_rate_and_time_left_are_measured_over_the_rows_of_30_seconds(screen: Screen) -> None:
-    """A slow environment makes 16 steps every 4 seconds, and most rows have none."""
-    progress = Progress(screen, 10_000)
-    for second in range(0, 120):
-        progress.show(row(16 * (second // 4), wall_seconds=float(second), env_steps_per_second=0.0))
+def test_small_rates_are_not_shown_as_0(screen: Screen) -> None:
+    Progress(screen, 10_000).show(row(464, env_steps_per_second=0.4, updates_per_second=0.0293))
     line = screen.getvalue().split(CLEAR)[-1]
-    assert "      4/s" in line
-    assert "left 43 min" in line  # 9,536 env_steps at 112 in 30 s
+    for part in ("    0.4/s", "left  6.6 h", "updates 0.029/s"):
+        assert part in line

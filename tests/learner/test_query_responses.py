@@ -158,7 +158,7 @@ def test_report_of_a_client_is_in_its_status_until_it_is_restarted() -> None:
     joining = Join(actor="a", incarnation=1, spaces=SPACES, environments=1)
     responses.join("a", encode(joining), 0.0)
     report = ClientReport(actor="a", incarnation=1, deadlines=9, missed_deadlines=2, safe_reason="x" * 1000)
-    assert read(responses.report("a", encode(report))) == Acknowledgement(verdict="accepted")
+    assert read(responses.report("a", encode(report), 7.0)) == Acknowledgement(verdict="accepted")
     (status,) = page(fleet, "", 0.0)
     assert (status.deadlines, status.missed_deadlines, len(status.safe_reason)) == (9, 2, 300)
     responses.join("a", encode(replace(joining, incarnation=2)), 0.0)
@@ -170,11 +170,11 @@ def test_report_that_is_not_of_the_actor_of_its_key_is_refused() -> None:
     responses, fleet = make_responses()
     responses.join("a", encode(Join(actor="a", incarnation=1, spaces=SPACES, environments=1)), 0.0)
     for report in (ClientReport(actor="b", incarnation=1), ClientReport(actor="a", incarnation=2)):
-        answer = read(responses.report("a", encode(report)))
+        answer = read(responses.report("a", encode(report), 7.0))
         assert isinstance(answer, Refusal)
         assert answer.code == "unknown"
     for data in (b"", b"DAED", encode(Join(actor="a", incarnation=1))):
-        answer = read(responses.report("a", data))
+        answer = read(responses.report("a", data, 7.0))
         assert isinstance(answer, Refusal)
         assert answer.code == "malformed"
-    assert fleet.actors["a"].client is None
+    assert fleet.actors["a"].report is None

@@ -13,11 +13,8 @@ from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_cont
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.learning_hints import EpisodeHint
 from daedalus.learner.reporting.metrics_rows import COLUMNS, Details
-from daedalus.learner.reporting.run_reporter import (
-    RateMeter,
-    RunReporter,
-    episode_statistics,
-)
+from daedalus.learner.reporting.rates import Rate, RateMeter, RunRates
+from daedalus.learner.reporting.run_reporter import RunReporter, episode_statistics
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.run_context import Health
@@ -44,16 +41,24 @@ def trained_counters(*returns: float) -> RunCounters:
     return counters
 
 
-def test_rates_are_since_the_last_measurement() -> None:
+def test_rates_are_over_ten_seconds_or_over_four_growths() -> None:
     counters = trained_counters()
     meter = RateMeter(counters, 10.0)
-    assert meter.rates == {}
+    assert meter.rates == RunRates()
     counters.trained([make_rollout(version=1, valid=EVERYTHING), make_rollout(version=4, valid=EVERYTHING)], 4, 1)
     expected = {"env_steps_per_second": 18.0, "updates_per_second": 0.5, "policy_lag_mean": 1.5}
     assert meter.measure(counters, joined_fleet(), 12.0) == expected
-    assert meter.rates == expected
-    stalled = {"env_steps_per_second": 0.0, "updates_per_second": 0.0}  # no rollout, so no policy lag
-    assert meter.measure(counters, joined_fleet(), 13.0) == stalled
+    # No rollout since, so no policy lag in the row, and the next batch is not late yet.
+    assert meter.measure(counters, joined_fleet(), 13.0) == {"env_steps_per_second": 18.0, "updates_per_second": 0.5}
+    assert (meter.rates.updates_per_second, meter.rates.policy_lag_mean) == (0.5, 1.5)
+    assert meter.measure(counters, joined_fleet(), 18.0)["updates_per_second"] == 0.25
+    assert meter.measure(counters, joined_fleet(), 99.0, is_stalled=True)["updates_per_second"] == 0.0
+    for seconds in (0.5, 50.0):  # from one growth to the next
+        rate = Rate(0.0, 0)
+        values = [rate.add(seconds * number, 10 * number) for number in range(1, 100)]
+        values += [rate.add(seconds * (99 + number), 990 + 30 * number) for number in range(1, 100)]
+        assert values[:99] == pytest.approx([10 / seconds] * 99)
+        assert values[-50:] == pytest.approx([30 / seconds] * 50)
 
 
 def test_rates_before_the_first_batch_and_after_the_last_are_unknown_and_nothing_is_divided_by_0() -> None:
@@ -160,14 +165,18 @@ HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
         ({"actor_seen": 97.0}, 0, ()),
         ({"actor_seen": 90.0}, 0, ("no live actor for 15 s",)),
         ({"actor_seen": 90.0}, 1, ()),
-        ({"updated": 44.0}, 1, ("no update for 61 s",)),
+        ({"updated": 44.0, "awaited_since": 44.0}, 1, ("no update for 61 s",)),
         ({"updated": 44.0, "actor_seen": 44.0}, 0, ("no live actor for 61 s",)),
         ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
-        ({"left_out": {"b", "a"}}, 3, ("batches do not wait for a, b: connected, but without rollouts",)),
+        (
+            {"left_out": {"b", "a"}},
+            3,
+            ("batches do not wait for a, b: connected, but far slower than the others, or hung",),
+        ),
         (
             {"left_out": set("abcdefg")},
             9,
-            ("batches do not wait for a, b, c, d, e and 2 more: connected, but without rollouts",),
+            ("batches do not wait for a, b, c, d, e and 2 more: connected, but far slower than the others, or hung",),
         ),
         (
             {"far_outside": {"b": ("returns", 50.0), "a": ("observations/position", 60.0), "c": ("returns", 44.0)}},
@@ -187,9 +196,9 @@ def test_measure_sets_the_rate_of_each_actor() -> None:
     fleet.actors["a"].env_steps = 40
     meter.measure(counters, fleet, 12.0)
     assert [fleet.actors[name].env_steps_per_second for name in ("a", "b")] == [20.0, 0.0]
-    fleet.actors["a"].env_steps = 50
+    fleet.set_present("a", 1, False, 12.5)
     meter.measure(counters, fleet, 13.0)
-    assert fleet.actors["a"].env_steps_per_second == 10.0
+    assert fleet.actors["a"].env_steps_per_second == 0.0
 
 
 def test_summary_is_json_and_contains_bytes_per_env_step() -> None:

@@ -40,7 +40,10 @@ class Harness:
         actors = [dataclasses.asdict(actor) for actor in self.fleet.actors.values()]
         return [
             self.fleet.spaces,
-            [{**each, "last_seen": None, "rejected": None, "consecutive_unfit": None} for each in actors],
+            [
+                {**each, "last_seen": None, "longest_silence": None, "rejected": None, "consecutive_unfit": None}
+                for each in actors
+            ],
         ]
 
 

@@ -118,6 +118,11 @@ _ACTOR = ActorStatus(
     safe_actions=40,
     rollouts_dropped=1,
     safe_reason="the learner did not confirm the policy within 30 s",
+    rows=700,
+    rollout_seconds=12.5,
+    waiting_seconds=0.25,
+    round_trip_seconds=0.125,
+    silence_limit_seconds=75.0,
 )
 
 MESSAGES: dict[str, Message] = {
@@ -186,6 +191,10 @@ MESSAGES: dict[str, Message] = {
         safe_actions=40,
         rollouts_dropped=1,
         safe_reason="the learner did not confirm the policy within 30 s",
+        rows=700,
+        rollout_seconds=12.5,
+        waiting_seconds=0.25,
+        round_trip_seconds=0.125,
     ),
     "evaluation_request": EvaluationRequest(evaluator="judge"),
     "evaluation_report": EvaluationReport(

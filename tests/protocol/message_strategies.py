@@ -11,6 +11,7 @@ from daedalus.protocol.messages import (
     ActorsPage,
     ActorsReport,
     ActorStatus,
+    ClientReport,
     CompactSnapshot,
     EvaluationReport,
     Event,
@@ -265,6 +266,9 @@ programs = st.binary(max_size=300).map(lambda data: np.frombuffer(data, "|u1"))
 _OWN: dict[type, st.SearchStrategy[Any]] = {
     Join: inferred(Join, spaces=st.none() | spaces, environments=st.integers(0, 4096)),
     Welcome: inferred(Welcome, epsilon=st.floats(0, 1), spec=run_specs.map(RunSpec.for_actors)),
+    ClientReport: inferred(
+        ClientReport, **dict.fromkeys(("rollout_seconds", "waiting_seconds", "round_trip_seconds"), st.floats(0, 1e9))
+    ),
     Program: inferred(Program, model=programs),
     Rollout: rollouts(),
     Gradient: gradients(),

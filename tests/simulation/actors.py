@@ -295,7 +295,8 @@ class ActorProcess:
         return None, True
 
     def _make_row(self) -> None:
-        self._step(self.session.fetch_next if self.session.is_fetch_due(self._now) else self.session.check_over)
+        session = self.session
+        self._step(session.act_in_rollout if session.begin_row(self._now) else session.check_over)
 
     def _end_rollout(self, identity: RolloutIdentity) -> None:
         if not self.outcome:

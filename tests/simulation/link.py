@@ -125,6 +125,9 @@ class Link:
             kernel.park(None)
         return came[0]
 
+    def query_by_key(self, key: str, payload: bytes = b"", *, timeout: float) -> list[tuple[str, bytes]]:
+        return [(key, answer) for answer in self.query(key, payload, timeout=timeout)]
+
     def ask(self, key: str, payload: bytes, timeout: float, on_answers: Callable[[list[bytes]], None]) -> None:
         """Query without waiting; call `on_answers` once, with all answers that arrive in time."""
         self._enter("query")

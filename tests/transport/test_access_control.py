@@ -15,7 +15,14 @@ from routers import listen_somewhere
 from daedalus.cli.commands.router import router
 from daedalus.learner.serving.actor_server import LOOK
 from daedalus.protocol import keys
-from daedalus.transport.credentials import CredentialsError, NotValidNowError, load, with_remedy
+from daedalus.transport.credentials import (
+    CredentialsError,
+    NotValidNowError,
+    credentials_to_listen,
+    load,
+    run_for,
+    with_remedy,
+)
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.zenoh_transport import connect, listen
 
@@ -249,6 +256,84 @@ def test_every_identity_sees_the_learner_disappear(address: str, certificates: P
         scene.until_heard(lambda: None, lambda: there == [True])
         scene.learner.close()
         scene.until_heard(lambda: None, lambda: there == [True, False])
+
+
+# --------------------------------------------------------------------------------------------- certificates of one run
+
+
+@pytest.fixture(scope="module")
+def users(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return certificates of two users, each for runs of their own, and of an operator and an actor of all runs."""
+    words = ("learner alice bob", "operator ann --run alice", "actor arm --run alice", "actor box")
+    return make_certificates(tmp_path_factory.mktemp("users") / "certs", *words)
+
+
+def test_a_certificate_of_one_run_keeps_it_apart_from_the_others(users: Path) -> None:
+    address, router = listen_somewhere(users / "router")
+    with closing(router), ExitStack() as stack:
+
+        def end(folder: str) -> Transport:
+            credentials = load(users / folder, folder.partition("-")[0])
+            return stack.enter_context(closing(connect([address], credentials)))
+
+        alice, bob, ann, arm, box = map(end, ("learner-alice", "learner-bob", "operator-ann", "actor-arm", "actor-box"))
+        everything = end("operator")
+
+        def served(run: str, name: str) -> list[tuple[str, str]]:
+            return [
+                (keys.join(run, name), "actor"),
+                (keys.rollouts(run, name), "actor"),
+                (keys.snapshots(run), "actor"),
+                (keys.program(run, "x"), "actor"),
+                (keys.status(run), "operator"),
+                (keys.orders(run, "ann"), "operator"),
+            ]
+
+        for run in ("alice", "alice.2", "bob"):
+            for key, _ in served(run, "*"):
+                alice.serve(key, lambda request: request.reply(b"alice"))  # also where it must not
+                if run == "bob":
+                    bob.serve(key, lambda request: request.reply(b"bob"))
+        for run in ("alice", "alice.2"):
+            for key, role in served(run, "arm"):
+                asks = arm if role == "actor" else ann
+                assert asks.query(key, b"x", timeout=LIMIT) == [b"alice"], key
+                assert bob.query(key, b"x", timeout=DENIED_SECONDS) == [], key
+        for key, role in served("bob", "arm"):
+            asks = arm if role == "actor" else ann
+            assert asks.query(key, b"x", timeout=DENIED_SECONDS / 2) == [], key
+        assert box.query(keys.join("bob", "box"), b"x", timeout=LIMIT) == [b"bob"], "alice cannot answer for bob"
+        assert sorted(box.query(keys.join("*", "box"), b"x", timeout=LIMIT)) == [b"alice", b"alice", b"bob"]
+        assert sorted(everything.query(keys.status("*"), b"x", timeout=LIMIT)) == [b"alice", b"alice", b"bob"]
+        news: list[bytes] = []
+        inbox = box.subscribe(keys.snapshots("bob"), lambda: news.append(inbox.take() or b""))
+
+        def publish() -> None:
+            alice.publish(keys.snapshots("bob"), b"forged")
+            bob.publish(keys.snapshots("bob"), b"bob")
+
+        Scene.until_heard(publish, lambda: len(news) > 5)
+        assert set(news) == {b"bob"}
+        read: list[bytes] = []
+        spying = alice.subscribe(keys.snapshots("bob"), lambda: read.append(spying.take() or b""))
+        present: list[str] = []
+        alice.watch_presence(keys.presence("bob", "*", "*"), lambda key, _: present.append(key))
+        box.declare_presence(keys.presence("bob", "box", 1))
+        bob.publish(keys.snapshots("bob"), b"secret")
+        bob.query(keys.join("bob", "box"), b"x", timeout=LIMIT)  # returns after everything sent before has arrived
+        alice.query(keys.join("alice", "arm"), b"x", timeout=LIMIT)
+        assert (read, present) == ([], [])
+
+
+def test_a_learner_of_one_run_does_not_listen_nor_serve_another(users: Path) -> None:
+    folder = users / "learner-alice"
+    with pytest.raises(CredentialsError, match=r"for the run 'alice' only, which may not listen: start a router"):
+        credentials_to_listen(["tls/127.0.0.1:1"], folder, "learner", insecure=False)
+    alice = load(folder, "learner")
+    assert [run_for(alice, run) for run in ("*", "alice", "alice.2")] == ["alice", "alice", "alice.2"]
+    assert run_for(load(users / "learner", "learner"), "bob") == "bob"
+    with pytest.raises(CredentialsError, match=r"is not for the run 'bob', only for 'alice' and alice\.ANYTHING"):
+        run_for(alice, "bob")
 
 
 # ------------------------------------------------------------------------------------- unknown identities and mistakes
