@@ -84,17 +84,10 @@ def slow_start(spec: RunSpec) -> str:
 
 
 def _in_turn(spec: RunSpec) -> bool:
-<<<<<<< HEAD
-    """Return whether an actor makes and steps several environments, one after the other."""
-    environment, several = spec.environment, spec.collection.envs_per_actor > 1
-    in_turn = environment.backend == "gymnasium" and not environment.processes
-    return several and in_turn and not environment.is_from_python  # which no new process can make
-=======
     """Return whether an actor makes and steps several environments in turn that could have processes of their own."""
     environment = spec.environment
     could = environment.backend == "gymnasium" and not environment.is_from_python
     return could and not environment.processes and spec.collection.envs_per_actor > 1
->>>>>>> pyapi
 
 
 def float_images(report: EnvironmentReport, spec: RunSpec) -> str:

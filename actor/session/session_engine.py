@@ -298,12 +298,12 @@ class ActorSession(PolicySession):
             # Before collecting, so that the rollout is of the newest policy.
             yield from self.wait(lambda: self.uploads.in_flight.has_room)
             self._warn_of_rejections()
-            if self.leave_by is not None:
-                yield from self.wait(lambda: False)  # until `check_leave` raises
             if not synchronous:
                 yield from self._await_fetch(self.now - began_waiting)
             yield self._load()
             began = self.now
+            if self.leave_by is not None:
+                yield from self.wait(lambda: False)  # until `check_leave` raises
             self._pace.begin_rollout(self.now)
             self._is_collecting = True
             rollout = yield from self._collect()

@@ -315,13 +315,8 @@ def test_slow_steps_suggest_processes_where_they_help() -> None:
     assert not slow_steps(waiting, spec(envs_per_actor=1), processors=2)
     assert not slow_steps(EnvironmentReport(step_seconds=0.001, busy_share=0.0), spec(), processors=2)
     assert not slow_steps(waiting.model_copy(update={"vectorized": True}), spec(), processors=2)
-<<<<<<< HEAD
-    for other in ({"id": "Any-v0", "processes": True}, {"id": "Any-v0", "processes": False}, {"id": "python:Any"}):
-        own = spec().model_copy(update={"environment": EnvironmentSpec.model_validate(other)})
-=======
     for environment in (EnvironmentSpec(id="Any-v0", processes=True), EnvironmentSpec(id="python:Mine")):
         own = spec().model_copy(update={"environment": environment})
->>>>>>> pyapi
         assert not slow_steps(waiting, own, processors=2)
 
 

@@ -155,6 +155,12 @@ def test_actor_that_is_asked_to_leave_finishes_its_rollout_and_awaits_the_verdic
     with pytest.raises(RunOverError, match=r"leave: 2 uploaded rollouts had no verdict yet, and may be lost$"):
         played.go(lambda: False)
     assert played.now == pytest.approx(leave_by, abs=1.0)
+    played = PlayedSession()
+    played.verdict = None
+    played.go(lambda: len(rollouts(played)) == 1)  # there is room for another
+    played.event(played.session.leave, played.now + 30.0)
+    with pytest.raises(RunOverError, match="leave: 1 uploaded rollouts"):
+        played.go(lambda: False)
 
 
 def test_actor_that_is_asked_to_leave_drops_a_rollout_that_takes_too_long_and_says_so() -> None:
