@@ -221,6 +221,9 @@ def run_locally(
             if status not in FINISHED:
                 raise RunFailedError(status=status)
             end = RunEnd(status=status, summary=evaluate_run(run, stopping, output, learner_streams))
+        except KeyboardInterrupt:  # in a function of the public API: trackers have little time then
+            stopping.set()
+            raise
         finally:
             trackers.finish(stopping)
         on_end(end)
