@@ -6,7 +6,6 @@ import os
 import re
 import sys
 import threading
-import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,17 +17,22 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.given_environment import giving
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.episodes import Evaluation, cut_note, environments_for, play_episodes
+from daedalus.actor.evaluation.episodes import (
+    Evaluation,
+    EvaluationProgress,
+    cut_note,
+    environments_for,
+    play_episodes,
+)
 from daedalus.actor.evaluation.video import FORMATS, Video
 from daedalus.launch.environment_object import NO_ENVIRONMENT, EnvironmentObject, environment_object
 from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.policy.saving.best_checkpoints import is_best
+from daedalus.policy.saving.best_checkpoints import evaluation_result
 from daedalus.policy.saving.hub import pull
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy, pretrained
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of, refuse_while_imported
 from daedalus.protocol.spec import Backend, EnvironmentSpec
-from daedalus.protocol.texts import short_number
 
 if TYPE_CHECKING:
     import gymnasium
@@ -36,7 +40,6 @@ if TYPE_CHECKING:
 EPISODES = 100  # without a video or a window
 _MOST_EPISODES = 1_000_000  # their results are held in memory
 _WIDTHS = range(16, 4097)
-_PROGRESS_SECONDS = 5.0  # between two lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,45 +108,6 @@ class EvaluationOptions:
             raise ValueError(
                 "--render needs a screen, and this machine has none: record the episodes with --video FILE.mp4"
             )
-
-
-class EvaluationStoppedError(Exception):
-    """Error of an evaluation that was stopped before its last episode ended."""
-
-
-class EvaluationProgress:
-    """Callback that reports progress every few seconds, and raises EvaluationStoppedError when `stop` is set.
-
-    On a terminal it rewrites one line.
-    """
-
-    def __init__(self, stream: TextIO, episodes: int, longest: int, stop: threading.Event) -> None:
-        self._stream, self._episodes, self._longest, self.stop = stream, episodes, longest, stop
-        self._terminal = stream.isatty()
-        self._due = time.monotonic() + _PROGRESS_SECONDS
-        self._rewriting = False
-
-    def __call__(self, finished: int, mean: float) -> bool:
-        """Show how many episodes have finished, and their mean return. Return False: the evaluation goes on."""
-        if self.stop.is_set():
-            raise EvaluationStoppedError
-        if time.monotonic() < self._due:
-            return False
-        self._due = time.monotonic() + _PROGRESS_SECONDS
-        so_far = (
-            f", mean return {short_number(mean)}" if finished else f" (each is cut after {self._longest:,} env_steps)"
-        )
-        line = f"evaluation: {finished} of {self._episodes} episodes{so_far}"
-        self._stream.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
-        self._stream.flush()
-        self._rewriting = self._terminal
-        return False
-
-    def end(self) -> None:
-        """Clear the rewritten line."""
-        if self._rewriting:
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
 
 
 def _has_screen() -> bool:
@@ -317,12 +281,15 @@ def _environment(policy: SavedPolicy, options: EvaluationOptions) -> Environment
     trained = policy.spec.environment
     if options.wrap is not None:
         trained = trained.model_copy(update={"wrap": None if options.wrap == "none" else options.wrap})
-    watched = options.watched
-    backend = options.backend or policy.spec.evaluation.final_backend or trained.backend
-    if watched:
-        backend = "gymnasium"
+    if options.watched:
+        return as_on_gymnasium(trained).model_copy(update={"processes": False})
+    return evaluated_environment(trained, options.backend or policy.spec.evaluation.final_backend or trained.backend)
+
+
+def evaluated_environment(trained: EnvironmentSpec, backend: Backend) -> EnvironmentSpec:
+    """Return the environment of an evaluation on a backend, of a policy trained in another one."""
     played = as_on_gymnasium(trained) if backend == "gymnasium" else trained.as_evaluated(backend)
-    return played.model_copy(update={"processes": played.processes and backend == "gymnasium" and not watched})
+    return played.model_copy(update={"processes": played.processes and backend == "gymnasium"})
 
 
 def _modules(policy: SavedPolicy, options: EvaluationOptions) -> UserModules:
@@ -377,24 +344,10 @@ def _actions(policy: SavedPolicy, options: EvaluationOptions) -> str:
 
 
 def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation, actions: str) -> dict[str, Any]:
-    returns = evaluation.returns
     note = _note(evaluation, policy.spec.evaluation.max_episode_env_steps, sampled=actions == "sampled")
-    return {
-        "environment": spec.id,
-        "backend": spec.backend,
-        "checkpoint": str(policy.directory),
-        "best_checkpoint": is_best(policy.directory),
-        "policy_version": policy.policy_version,
-        "episodes": len(returns),
-        "notes": [note] if note else [],
-        "return_mean": float(returns.mean()),
-        "return_std": float(returns.std()),
-        "return_min": float(returns.min()),
-        "return_max": float(returns.max()),
-        "length_mean": float(evaluation.lengths.mean()),
-        "returns": returns.tolist(),
-        "lengths": evaluation.lengths.tolist(),
-    }
+    returns, lengths, notes = evaluation.returns, evaluation.lengths, [note] if note else []
+    result = evaluation_result(policy.directory, policy.policy_version, spec, returns, lengths, notes)
+    return {**result, "returns": returns.tolist(), "lengths": lengths.tolist()}
 
 
 def _note(evaluation: Evaluation, longest: int, *, sampled: bool) -> str:

@@ -1,25 +1,45 @@
-"""The evaluation after training: selection of the best checkpoint, then the final episodes, by `daedalus evaluate`."""
+"""The process of the evaluation after training: it selects the best checkpoint, and lets evaluators play with it."""
 
-import json
+import argparse
 import logging
 import math
-import signal
-import tempfile
+import sys
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from daedalus.launch.child_output import STREAMS, ChildOutput
-from daedalus.launch.local_run import LocalRun, evaluation_arguments
-from daedalus.launch.supervision import Child, StartPlayer, start, stop
+import numpy as np
+
+from daedalus.actor.evaluation.episodes import EvaluationStoppedError
+from daedalus.launch.evaluation import evaluated_environment
+from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.process_lifecycle import (
+    FAILED,
+    UNSAVED,
+    UNWRITABLE,
+    exit_on_thread_exceptions,
+    exit_with_parent,
+    stop_on_signals,
+)
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.candidates import candidates
-from daedalus.protocol.spec import RunSpec
+from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
+from daedalus.policy.acting.runtime import program_hash
+from daedalus.policy.saving.best_checkpoints import best_score, is_best, is_best_in_training, rescore
+from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, read_candidates
+from daedalus.policy.saving.sealed import DamagedError
+from daedalus.protocol.messages import EvaluationReport, Program
+from daedalus.protocol.spec import Backend, RunSpec
 from daedalus.protocol.texts import short_number
+from daedalus.transport.connecting import listen
+from daedalus.transport.interface import Transport, TransportError
 
+_logger = logging.getLogger("daedalus.launch.final_evaluation")  # this module is __main__ in the process
+
+# Added to the seed of the run, so that neither training nor another evaluation uses these seeds.
+_FINAL_SEEDS, _SELECTION_SEEDS = 2**32, 2**33
 _ERRORS = 3.0  # standard errors between two means that differ
 _FEWEST = 10  # episodes, from which on their standard error means something
 
@@ -59,93 +79,6 @@ def _error(evaluation: dict[str, Any]) -> float:
     return evaluation["return_std"] / math.sqrt(evaluation["episodes"])
 
 
-_POLL_SECONDS = 0.05
-_REPORTED = (1, 2)  # exit statuses of a `daedalus evaluate` that has printed the reason
-
-
-class EvaluationFailedError(Exception):
-    """Error of an evaluation that failed or was stopped. The message holds output that was not printed yet."""
-
-
-class EvaluationProcess:
-    """One `daedalus evaluate`. The caller closes it."""
-
-    def __init__(
-        self, arguments: Sequence[str], name: str, output: ChildOutput, start: StartPlayer, *, shown: bool
-    ) -> None:
-        """Start the process.
-
-        Args:
-          arguments: of `daedalus evaluate`.
-          name: of the process, different from that of every other one that runs.
-          output: reads what it writes.
-          start: starts the process.
-          shown: show its progress.
-        """
-        self._name, self._output = name, output
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in close)
-        try:
-            with output.pipes(name, shown=STREAMS if shown else ()) as streams:
-                own = replace(streams, stdout=self._file.fileno())
-                self._process = start("daedalus.cli.commands.evaluate", *arguments, "--json", streams=own)
-        except BaseException:
-            self._file.close()
-            raise
-
-    @property
-    def process(self) -> Child:
-        """The child process."""
-        return self._process
-
-    def result(self) -> dict[str, Any]:
-        """Return the result of a process that has ended. Raises EvaluationFailedError if it failed."""
-        status = self._process.poll()
-        assert status is not None
-        self._file.seek(0)
-        text = self._file.read()
-        if status == 0 and text:
-            return json.loads(text)
-        # The environment may have printed much: the error is at the end.
-        lines = self._output.unshown(self._name)
-        reported = status in _REPORTED and self._output.last_error(self._name)
-        raise EvaluationFailedError("\n".join(lines if reported else [*lines, _died(status)]))
-
-    def close(self) -> None:
-        """End the process if it still runs."""
-        stop([self._process])
-        self._file.close()
-
-
-def _died(status: int) -> str:
-    """Return the error of an evaluation whose process ended without a result, from its exit status."""
-    if status == -getattr(signal, "SIGKILL", 9):
-        return "an evaluation was killed (signal 9): check whether it was killed for lack of memory"
-    how = f"signal {-status}" if status < 0 else f"status {status}"
-    return f"the environment or one of its libraries ended an evaluation ({how}): play it with `daedalus check`"
-
-
-def play(
-    commands: list[list[str]], stopping: threading.Event, output: ChildOutput, start: StartPlayer = start
-) -> list[dict[str, Any]]:
-    """Run `daedalus evaluate` once for each list of arguments, all at the same time, and return the results.
-
-    The progress of the first one is shown. Raises EvaluationFailedError.
-    """
-    evaluations: list[EvaluationProcess] = []
-    try:
-        for arguments in commands:
-            name = f"evaluation-{len(evaluations)}"
-            evaluations.append(EvaluationProcess(arguments, name, output, start, shown=not evaluations))
-        while any(evaluation.process.poll() is None for evaluation in evaluations):
-            if stopping.wait(_POLL_SECONDS):
-                raise EvaluationFailedError
-        return [evaluation.result() for evaluation in evaluations]
-    finally:
-        stop([evaluation.process for evaluation in evaluations])  # all at the same time
-        for evaluation in evaluations:
-            evaluation.close()
-
-
 def without_episodes(result: dict[str, Any]) -> dict[str, Any]:
     """Return a result of `daedalus evaluate` without the lists of the episodes' returns and lengths."""
     return {name: value for name, value in result.items() if name not in ("returns", "lengths")}
@@ -160,82 +93,132 @@ def evaluation_summary(evaluation: dict[str, Any], **more: Any) -> dict[str, Any
     }
 
 
-_logger = logging.getLogger(__name__)
+class FinalEpisodes:
+    """The episodes after training, in the process that offers the policies to the evaluators."""
 
-_SEEDS = 2**33  # added to the seed of the run, so that neither training nor the final evaluation uses these seeds
+    def __init__(self, directory: Path, spec: RunSpec, transport: Transport, stop: threading.Event) -> None:
+        """Construct what lets them be played.
+
+        Args:
+          directory: of a run that has been trained.
+          spec: of the run.
+          transport: reaches the evaluators.
+          stop: ends the evaluations early.
+        """
+        self._directory, self._spec, self._stop = directory, spec, stop
+        self._host = EvaluatorHost(run_directory.run_name(directory), transport)
+
+    def play(
+        self, policies: list[SavedPolicy], backend: Backend, seeds: int, actions: Literal["greedy", "sampled"]
+    ) -> list[tuple[dict[str, Any], EvaluationReport]]:
+        """Return the result and the report of each policy. Raises EvaluatorError and EvaluationStoppedError."""
+        plan = EpisodePlan(
+            spec=self._spec,
+            environment=evaluated_environment(self._spec.environment, backend),
+            spaces=policies[0].spaces,
+            episodes=self._spec.evaluation.final_episodes,
+            seed=self._spec.training.seed + seeds,
+            actions=actions,
+        )
+        reports = self._host.play(plan, [_offered(each) for each in policies], lambda: not self._stop.is_set())
+        if reports is None:
+            raise EvaluationStoppedError
+        return [
+            (plan.result(policy.directory, report), report) for policy, report in zip(policies, reports, strict=True)
+        ]
+
+    def select_best(self) -> list[dict[str, Any]]:
+        """Re-evaluate the candidates, save their new scores, and return the scores, the best first.
+
+        The episodes are those of the training's backend: a selection by the score on the final backend would make that
+        score the best of several.
+
+        Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
+        Raises as `play`.
+        """
+        finalists = read_candidates(self._directory)
+        if len(finalists) < 2:
+            return []
+        backend, evaluation = self._spec.environment.backend, self._spec.evaluation
+        text = "selecting the best of %d checkpoints: %d episodes each on %s"
+        _logger.info(text, len(finalists), evaluation.final_episodes, backend)
+        scores = []
+        played = self.play(finalists, backend, _SELECTION_SEEDS, evaluation.actions)
+        for policy, (result, _) in zip(finalists, played, strict=True):
+            version, mean, std = policy.policy_version, result["return_mean"], result["return_std"]
+            before = ""
+            if is_best(policy.directory):
+                when = "in training" if is_best_in_training(policy.directory) else "before"
+                before = f" ({short_number(best_score(policy.directory))} {when})"
+            _logger.info("  policy version %d: %s +- %s%s", version, short_number(mean), short_number(std), before)
+            try:
+                rescore(policy.directory, mean, version)
+            except OSError as error:
+                reason = error.strerror or error
+                _logger.warning("  the score of policy version %d could not be saved: %s", version, reason)
+            scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
+        return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
+
+    def evaluate(self) -> None:
+        """Select the best checkpoint, play the final episodes with it, and write summary.json and evaluation.json.
+
+        If greedy episodes are clearly worse than training was, the same episodes are played with sampled actions, too,
+        unless the policy is greedy anyway, or sampled episodes have confirmed the target. A note says where training
+        plays another task, whose returns say nothing about these. Raises as `play`, OSError, and as `find_policy`.
+        """
+        began, directory, spec = time.monotonic(), self._directory, self._spec
+        summary = run_directory.read_json(directory / run_directory.SUMMARY)
+        chosen = self.select_best()
+        best, backend = [find_policy(directory)], spec.evaluation.final_backend or spec.environment.backend
+        ((evaluation, report),) = self.play(best, backend, _FINAL_SEEDS, spec.evaluation.actions)
+        confirmed = summary.get("confirmation") is not None  # by sampled episodes
+        can_differ = spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
+        true_task, trained = spec.environment.trains_true_task, summary.get("episode_return_mean")
+        if not true_task and trained is not None:
+            evaluation["notes"].append(other_task_note(trained))
+        if true_task and not confirmed and can_differ and is_below_training(evaluation, trained):
+            ((sampled, _),) = self.play(best, backend, _FINAL_SEEDS, "sampled")
+            evaluation["notes"].append(sampled_note(evaluation, sampled))
+            summary["sampled_evaluation"] = sampled
+        summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)
+        evaluation |= {"returns": report.returns.tolist(), "lengths": report.lengths.tolist()}
+        run_directory.write_json(directory / run_directory.EVALUATION, evaluation)
+        run_directory.write_json(directory / run_directory.SUMMARY, summary)
 
 
-def select_best(
-    directory: Path,
-    spec: RunSpec,
-    options: list[str],
-    stopping: threading.Event,
-    output: ChildOutput,
-    start: StartPlayer = start,
-) -> list[dict[str, Any]]:
-    """Re-evaluate the candidates, save their new scores, and return the scores, the best first.
-
-    Args:
-      directory: the run directory.
-      spec: the specification of the run.
-      options: options for each `daedalus evaluate`.
-      stopping: ends the evaluations early when it is set.
-      output: reads what the evaluations write. It shows the progress of the first one.
-      start: starts each process.
-
-    Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
-    Raises EvaluationFailedError.
-    """
-    finalists = candidates(directory)
-    if len(finalists) < 2:
-        return []
-    backend, seed = spec.environment.backend, spec.training.seed + _SEEDS
-    _logger.info(
-        "selecting the best of %d checkpoints: %d episodes each on %s",
-        len(finalists),
-        spec.evaluation.final_episodes,
-        backend,
-    )
-    options = [*options, "--backend", backend, "--seed", str(seed)]
-    results = play([[str(each.directory), *options] for each in finalists], stopping, output, start)
-    scores = []
-    for candidate, result in zip(finalists, results, strict=True):
-        version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
-        before = ""
-        if candidate.score is not None:
-            before = f" ({short_number(candidate.score)} {'in training' if candidate.of_training else 'before'})"
-        _logger.info("  policy version %d: %s +- %s%s", version, short_number(mean), short_number(std), before)
-        try:
-            candidate.rescore(mean)
-        except OSError as error:
-            _logger.warning("  the score of policy version %d could not be saved: %s", version, error.strerror or error)
-        scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
-    return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
+def _offered(policy: SavedPolicy) -> OfferedPolicy:
+    program = Program(hash=program_hash(policy.program), model=np.frombuffer(policy.program, np.uint8))
+    return OfferedPolicy(policy_version=policy.policy_version, program=program, weights=policy.weights)
 
 
-def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
-    """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
+def main() -> int:
+    """Run the process that offers the policies to the evaluators, and return its exit status."""
+    options = argparse.ArgumentParser()
+    options.add_argument("directory", type=Path)
+    options.add_argument("address")
+    options.add_argument("--log-level", default="info")
+    options.add_argument("--log-json", action="store_true")
+    options.add_argument("--exit-with-parent", action="store_true")
+    parsed = options.parse_args()
+    configure_logging(parsed.log_level, as_json=parsed.log_json)
+    stop = stop_on_signals(exit_if_stuck=True)
+    exit_with_parent(stop)
+    try:
+        with closing(listen([parsed.address])) as transport:
+            FinalEpisodes(parsed.directory, run_directory.read_config(parsed.directory), transport, stop).evaluate()
+    except (EvaluatorError, NoPolicyError, DamagedError, SettingsError, TransportError) as error:
+        print_error("train", error)
+        return FAILED
+    except EvaluationStoppedError:
+        return FAILED
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        print_error("train", f"the evaluation could not be saved: {error.strerror}")
+        return UNSAVED
+    return 0
 
-    If greedy episodes are clearly worse than training was, the same episodes are played with sampled actions, too,
-    unless the policy is greedy anyway, or sampled episodes have confirmed the target. A note says where training
-    plays another task, whose returns say nothing about these. Raises EvaluationFailedError.
-    """
-    began = time.monotonic()
-    summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
-    options = ["--episodes", str(run.spec.evaluation.final_episodes), *evaluation_arguments(run)]
-    chosen = select_best(run.directory, run.spec, options, stopping, output, run.start_player)
-    (evaluation,) = play([[str(run.directory), *options]], stopping, output, run.start_player)
-    confirmed = summary.get("confirmation") is not None  # by sampled episodes
-    can_differ = run.spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
-    true_task = run.spec.environment.trains_true_task
-    if not true_task and summary.get("episode_return_mean") is not None:
-        evaluation["notes"].append(other_task_note(summary["episode_return_mean"]))
-    if true_task and not confirmed and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
-        commands = [[str(run.directory), *options, "--actions", "sampled"]]
-        (sampled,) = play(commands, stopping, output, run.start_player)
-        evaluation["notes"].append(sampled_note(evaluation, sampled))
-        summary["sampled_evaluation"] = without_episodes(sampled)
-    summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)
-    run_directory.write_json(run.directory / run_directory.EVALUATION, evaluation)
-    run_directory.write_json(run.directory / run_directory.SUMMARY, summary)
-    return summary
+
+if __name__ == "__main__":
+    exit_on_thread_exceptions()
+    sys.exit(main())

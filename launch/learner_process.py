@@ -23,7 +23,7 @@ from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
 from daedalus.launch.run_choice import NewRun, with_record
-from daedalus.launch.supervision import FailedError, stop, supervised_actor
+from daedalus.launch.supervision import evaluators
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress, SilentProgress
@@ -272,7 +272,9 @@ class LearnerProcess:
         run = run if run.exists else self._with_directory(run, stack)
         try:
             say = self._progress.say
-            output = stack.enter_context(ChildOutput(run.directory / run_directory.OUTPUT, say, say))
+            # The launcher of a prepared run writes output.log itself: a file has one writer.
+            log = run_directory.CONFIRMATION_OUTPUT if options.prepared else run_directory.OUTPUT
+            output = stack.enter_context(ChildOutput(run.directory / log, say, say))
             service = self._service(run, transport, restored, initial, spaces, output)
             self._announce(run)
             if options.prepared is None:  # else the launcher starts them
@@ -361,23 +363,13 @@ class LearnerProcess:
             return
         needed = modules_of(run.spec.environment.user_modules)
         allowed = allow_words(module for module in needed if module in run.modules.allowed)
-        options = (*helper_log_words(self._options.log), *allowed, "--evaluator")
-        with private_address() as address, closing(listen([address])) as transport:
-            process = supervised_actor(_PLAYER, address, options, output.pipes, output.last_error)
-
-            def failure() -> str:
-                try:
-                    restarted = process.check()
-                except FailedError as error:
-                    return str(error)
-                if restarted:
-                    _logger.warning("%s", restarted)
-                return ""
-
-            try:
-                yield Player(transport, failure)
-            finally:
-                stop([process.process])
+        options = *helper_log_words(self._options.log), *allowed
+        with (
+            private_address() as address,
+            closing(listen([address])) as transport,
+            evaluators(address, [_PLAYER], options, output) as failure,
+        ):
+            yield Player(transport, failure)
 
 
 def how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:

@@ -137,11 +137,6 @@ def actor_arguments(run: LocalRun) -> tuple[str, ...]:
     return *helper_log_words(run.logs), *allow_settings(run.spec.actor_modules)
 
 
-def evaluation_arguments(run: LocalRun) -> list[str]:
-    """Return the arguments of every `daedalus evaluate`."""
-    return [*run.logs.words(), *allow_settings(run.spec.environment.user_modules)]
-
-
 def gateway_arguments(run: LocalRun) -> tuple[str, ...]:
     """Return the arguments of the gateway with the page."""
     camera = allow_settings(run.spec.user_modules) if run.camera else ["--no-camera"]

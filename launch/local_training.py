@@ -1,6 +1,7 @@
 """One run on this machine: training by supervised processes, then the evaluation of the result."""
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -8,7 +9,6 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from daedalus.launch.child_output import ChildOutput, OpenStreams, inherited
-from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
 from daedalus.launch.local_run import (
     LocalRun,
     RunEnd,
@@ -17,16 +17,18 @@ from daedalus.launch.local_run import (
     UnsavedError,
     actor_arguments,
     gateway_arguments,
+    helper_log_words,
     learner_arguments,
     resume_command,
 )
-from daedalus.launch.process_lifecycle import ORDERED, SUPERSEDED, UNSAVED, UNWRITABLE
+from daedalus.launch.process_lifecycle import FAILED, ORDERED, SUPERSEDED, UNSAVED
 from daedalus.launch.supervision import (
     GATEWAY,
     LEARNER_GRACE_SECONDS,
     Child,
     FailedError,
     Supervised,
+    evaluators,
     start,
     stop,
     supervised_actor,
@@ -37,6 +39,8 @@ from daedalus.learner.run import run_directory
 from daedalus.learner.run.run_directory import OPERATOR_TOKEN
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import EventFile
+from daedalus.policy.saving.saved_policy import candidates
+from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.texts import one_line
 from daedalus.transport.private_address import private_address
 
@@ -216,14 +220,17 @@ def run_locally(
                 raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
             if status not in FINISHED:
                 raise RunFailedError(status=status)
-            end = RunEnd(status=status, summary=_evaluated(run, stopping, output))
+            end = RunEnd(status=status, summary=evaluate_run(run, stopping, output, learner_streams))
+        except KeyboardInterrupt:  # in a function of the public API: trackers have little time then
+            stopping.set()
+            raise
         finally:
             trackers.finish(stopping)
         on_end(end)
         if run.keeps_page:
             _keep(page, stopping)
         return end
-    except (FailedError, EvaluationFailedError) as error:
+    except FailedError as error:
         if stopping.is_set():
             raise RunStoppedError from None
         raise RunFailedError(str(error)) from None
@@ -247,13 +254,43 @@ def _remedy(run: LocalRun) -> str:
     return f"make room on the disk, or make it writable, then type: {resume_command(run)}"
 
 
-def _evaluated(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
-    """Return the summary with the evaluation. Raises UnsavedError on a full disk, and EvaluationFailedError."""
+def evaluate_run(
+    run: LocalRun, stopping: threading.Event, output: ChildOutput, open_streams: OpenStreams = inherited
+) -> dict[str, Any]:
+    """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
+
+    A process offers the policies, and evaluators play: for several candidates several at a time.
+
+    Args:
+      run: which has been trained.
+      stopping: ends the evaluations early when it is set.
+      output: reads what the evaluators print. It shows the progress of the first one.
+      open_streams: where the process that offers the policies writes its log.
+
+    Raises RunStoppedError, RunFailedError, and UnsavedError on a full disk.
+    """
     if not (run.directory / run_directory.SUMMARY).exists():  # the learner has said why
         raise UnsavedError(f"the summary of the run could not be saved: {_remedy(run)}")
-    try:
-        return evaluate_run(run, stopping, output)
-    except OSError as error:
-        if error.errno not in UNWRITABLE:
-            raise
-        raise UnsavedError(f"the evaluation could not be saved: {error.strerror}: {_remedy(run)}") from None
+    names = [f"evaluation-{number}" for number in range(min(len(candidates(run.directory)) or 1, os.cpu_count() or 1))]
+    options = *helper_log_words(run.logs), *allow_settings(run.spec.environment.user_modules)
+    with private_address() as address:
+        with open_streams("evaluation") as streams:
+            arguments = (str(run.directory), address, *run.logs.words())
+            host = start("daedalus.launch.final_evaluation", *arguments, streams=streams, descriptors=run.lock)
+        try:
+            with evaluators(address, names, options, output, run.start_player) as failure:
+                while host.poll() is None:
+                    if stopping.wait(_POLL_SECONDS):
+                        raise RunStoppedError
+                    if reason := failure():
+                        raise RunFailedError(reason)
+        finally:
+            stop([host])
+    if host.returncode and stopping.is_set():  # it was stopped as well
+        raise RunStoppedError
+    if host.returncode == UNSAVED:
+        raise UnsavedError(_remedy(run))
+    if host.returncode:
+        how = f"the process of the evaluation ended with status {host.returncode}"
+        raise RunFailedError("" if host.returncode == FAILED else how)  # it has printed the reason
+    return run_directory.read_json(run.directory / run_directory.SUMMARY)

@@ -1,18 +1,22 @@
 """Supervision of child processes: start them, restart them if they die, and end all of them."""
 
+import logging
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence, Set
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
-from daedalus.launch.child_output import OpenStreams, Streams, inherited
+from daedalus.launch.child_output import ChildOutput, OpenStreams, Streams, inherited
 from daedalus.launch.forked_process import ForkedProcess
-from daedalus.launch.process_lifecycle import STOPPED, interrupts_held
+from daedalus.launch.process_lifecycle import FAILED, STOPPED, interrupts_held
+
+_logger = logging.getLogger(__name__)
 
 GATEWAY = "gateway"  # name of its process
 # Exit status that means something for a learner only.
@@ -27,6 +31,7 @@ _CRASHES = {
 _MOST_FAILURES = 3  # of one process, in a row
 _SOON_SECONDS = 60.0  # a process that ran for longer before it ended starts a new count
 _MOST_RESTARTS = 1000  # of one process that is killed from outside
+_REPORT_SECONDS = 5.0  # from the end of an evaluator that failed to that of its host, even on a busy machine
 _LEAVING_SECONDS = 30.0  # between the end of the first process and the end of the others
 _GRACE_SECONDS = 4.0  # from SIGTERM to SIGKILL
 LEARNER_GRACE_SECONDS = 30.0  # the same for a learner: it waits for a slow disk, but not longer, and ends by itself
@@ -106,6 +111,7 @@ class Supervised:
     # Exit statuses of a process that has not failed by itself, and how it ended.
     no_fault: Mapping[int, str] = field(default_factory=lambda: _LEARNERS_RESTARTS)
     reason: Callable[[int], str] = _reason  # of its last failure, from the exit status
+    most_restarts: int = _MOST_RESTARTS
     restarts: int = 0
     failures: int = 0  # in a row, each soon after the start
     process: Child = field(init=False)
@@ -154,8 +160,11 @@ class Supervised:
         self.failures += -status in _CRASHES if status < 0 else status not in self.no_fault
         if self.failures >= _MOST_FAILURES:
             raise FailedError(self.name, self.reason(status), f"failed {self.failures} times")
-        if self.restarts >= _MOST_RESTARTS:
-            raise FailedError(self.name, f"it {self._describe(status)}", f"was started {self.restarts} times")
+        if self.restarts >= self.most_restarts:
+            memory = "; check whether it was for lack of memory" if status == -getattr(signal, "SIGKILL", 9) else ""
+            raise FailedError(
+                self.name, f"it {self._describe(status)}{memory}", f"was started {self.restarts + 1} times"
+            )
         self.restarts += 1
         self._start(first=False)
         return f"{self.name} {self._describe(status)}; started again"
@@ -199,6 +208,51 @@ def supervised_actor(
         return said or f"the environment ends the process ({how}): play it with `daedalus check`"
 
     return Supervised(name, begin, ended={0}, no_fault={}, reason=reason)
+
+
+@contextmanager
+def evaluators(
+    address: str, names: Sequence[str], options: tuple[str, ...], output: ChildOutput, start: StartPlayer = start
+) -> Iterator[Callable[[], str]]:
+    """Start evaluators of this machine, and end them at the end.
+
+    Args:
+      address: private, of an EvaluatorHost.
+      names: of the evaluators. What the first one prints is shown.
+      options: further options of `daedalus actor`.
+      output: reads what they print.
+      start: starts each process.
+
+    Yields a function that restarts those that died, and returns why one failed for good, or an empty string.
+    """
+    started: list[Supervised] = []
+    failed_at: dict[int, float] = {}  # by process id
+
+    def failure() -> str:
+        now = time.monotonic()
+        for each in started:
+            process = each.process
+            if process.poll() == FAILED and now < failed_at.setdefault(process.pid, now) + _REPORT_SECONDS:
+                continue  # it has told the host why, which then ends the episodes
+            try:
+                restarted = each.check()
+            except FailedError as error:
+                return str(error)
+            if restarted:
+                _logger.warning("%s", restarted)
+        return ""
+
+    try:
+        for name in names:
+            streams = output.pipes if name == names[0] else partial(output.pipes, shown=())
+            each = supervised_actor(name, address, (*options, "--evaluator"), streams, output.last_error, start)
+            # Until the end of the block, every end of a process is a failure. They play few episodes: if one is killed
+            # again and again, there is a reason.
+            each.ended, each.most_restarts = frozenset(), _MOST_FAILURES - 1
+            started.append(each)
+        yield failure
+    finally:
+        stop([each.process for each in started])
 
 
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:

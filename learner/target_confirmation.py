@@ -4,46 +4,30 @@ The mean of the newest training episodes reaches the target more probably in a l
 the policy changed. So their mean is too high on average, and the policy of that moment may be worse than those before.
 New sampled episodes with that policy show what it can do.
 
-The evaluator is a process that the launcher starts here. It has a transport of its own, which nobody else reaches: it
-needs no certificate, and no actor can report in its place.
+The evaluator is a process of this host: learner/serving/evaluator_host.py.
 """
 
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
-from daedalus.learner.serving.waiting_requests import read_request
-from daedalus.policy.saving.best_checkpoints import is_best
-from daedalus.protocol import keys
-from daedalus.protocol.codec import encode
-from daedalus.protocol.limits import JOIN_LIMITS, Limits
-from daedalus.protocol.messages import (
-    Acknowledgement,
-    EvaluationReport,
-    EvaluationRequest,
-    Join,
-    Refusal,
-    Welcome,
-)
-from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.texts import bounded_text, exact_number, short_number
-from daedalus.transport.interface import Request, Transport, TransportError
+from daedalus.protocol.messages import EvaluationReport
+from daedalus.protocol.texts import exact_number, short_number
+from daedalus.transport.interface import Transport, TransportError
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpointer import Checkpointer
     from daedalus.learner.training.learner import Learner
 
 _CONFIDENCE = 0.95  # share of cases that an interval is to contain
-_POLL_SECONDS = 0.05
 _SEEDS = 2**34  # added to the seed of the run: no other evaluation of the run and no training uses these seeds
 
 _logger = logging.getLogger(__name__)
@@ -109,85 +93,12 @@ def _t_within(angle: float, freedom: int) -> float:
     return math.sin(angle) * total
 
 
-def _result(spec: RunSpec, checkpoint: Path, report: EvaluationReport) -> dict[str, Any]:
-    """Return what summary.json has of new episodes, named as in a result of `daedalus evaluate`."""
-    returns = report.returns
-    return {
-        "environment": spec.environment.id,
-        "backend": spec.environment.backend,
-        "checkpoint": str(checkpoint),
-        "best_checkpoint": is_best(checkpoint),
-        "policy_version": report.policy_version,
-        "episodes": len(returns),
-        "notes": [bounded_text(report.note)] if report.note else [],
-        "return_mean": float(returns.mean()),
-        "return_std": float(returns.std()),
-        "return_min": float(returns.min()),
-        "return_max": float(returns.max()),
-        "length_mean": float(report.lengths.mean()),
-        "seed": spec.training.seed + _SEEDS,
-        "actions": "sampled",
-    }
-
-
 @dataclass(frozen=True, slots=True)
 class Player:
     """An evaluator that reaches `transport`, as nobody else does."""
 
     transport: Transport
     failure: Callable[[], str]  # why it has failed for good; empty as long as it may still play
-
-
-class PlayerError(Exception):
-    """The episodes cannot be played."""
-
-
-class _Conversation:
-    """What the learner says to the player, on the transport's threads: what to play, and with which policy."""
-
-    def __init__(self, context: RunContext, program: bytes, snapshot: bytes) -> None:
-        """`program` and `snapshot` are encoded messages."""
-        training = context.spec.training
-        self._run, self._program, self._snapshot = context.name, program, snapshot
-        self._welcome = encode(
-            Welcome(
-                run=context.name,
-                learner_epoch=context.learner_epoch,
-                seed=training.seed,
-                spec=context.spec.for_actors(),
-                confirm_episodes=training.target_episodes,
-                confirm_seed=training.seed + _SEEDS,
-            )
-        )
-        self._limits = Limits(max_bytes=16 * training.target_episodes + (1 << 10), max_arrays=2)
-        self.over = threading.Event()
-        self.report: EvaluationReport | None = None
-        self.failure = ""  # why there is no report
-
-    def open(self, transport: Transport) -> None:
-        """Start to answer the player."""
-        transport.serve(keys.program(self._run, "*"), lambda request: request.reply(self._program))
-        transport.serve(keys.evaluations(self._run, "*"), self._on_evaluation)
-        transport.serve(keys.join(self._run, "*"), self._on_join)
-
-    def _on_join(self, request: Request) -> None:
-        message = read_request(request.payload, JOIN_LIMITS, Join)
-        if isinstance(message, Join) and message.failure:
-            self.failure = bounded_text(message.failure)
-            self.over.set()
-        request.reply(encode(message) if isinstance(message, Refusal) else self._welcome)
-
-    def _on_evaluation(self, request: Request) -> None:
-        message = read_request(request.payload, self._limits, EvaluationRequest, EvaluationReport)
-        match message:
-            case EvaluationRequest():
-                request.reply(self._snapshot)
-            case EvaluationReport():
-                self.report = message
-                self.over.set()
-                request.reply(encode(Acknowledgement(verdict="accepted")))
-            case Refusal():
-                request.reply(encode(message))
 
 
 class TargetConfirmation:
@@ -232,15 +143,16 @@ class TargetConfirmation:
         text = f"target {target} reached: the policy of this moment plays {episodes} to confirm it"
         self._context.events.add("target", text, cause=f"version {version}")
         try:
-            report = self._played_with(learner)
-        except (PlayerError, TransportError, OSError) as error:  # such as a simulator of which only one runs at a time
+            played = self._played_with(learner)
+        except (EvaluatorError, TransportError, OSError) as error:  # of some simulators only one can run
             text = f"the target cannot be confirmed: {error}"
             self._context.events.add("target", text, cause=f"result of version {version}")
             return True
-        if report is None:  # the run is stopped; when it is resumed, it asks again
+        if played is None:  # the run is stopped; when it is resumed, it asks again
             return False
         assert training.target_return is not None
-        result = confirmation(_result(self._context.spec, saving.directory, report), training.target_return)
+        plan, report = played
+        result = confirmation(plan.result(saving.directory, report), training.target_return)
         if result["confirmed"]:
             self.result = result
             return True
@@ -255,20 +167,33 @@ class TargetConfirmation:
         self._context.events.add("target", text, cause=f"result of version {version}")
         return False
 
-    def _played_with(self, learner: "Learner") -> EvaluationReport | None:
-        """Return the player's report, or None if the run is stopped first. Raises PlayerError and as `open_player`."""
-        snapshot = self._publisher.encoded(learner.policy_version, learner.weights())
-        conversation = _Conversation(self._context, self._publisher.program("*"), snapshot)
+    def _played_with(self, learner: "Learner") -> tuple[EpisodePlan, EvaluationReport] | None:
+        """Return the episodes, or None if the run is stopped first.
+
+        Raises EvaluatorError, and as `open_player`.
+        """
+        context, program = self._context, self._publisher.offered
+        spec, spaces = context.spec, context.fleet.spaces
+        assert program is not None
+        assert spaces is not None
+        plan = EpisodePlan(
+            spec=spec,
+            environment=spec.environment.as_evaluated(),
+            spaces=spaces,
+            episodes=spec.training.target_episodes,
+            seed=spec.training.seed + _SEEDS,
+            actions="sampled",
+        )
+        policy = OfferedPolicy(policy_version=learner.policy_version, program=program, weights=learner.weights())
         with self._open_player() as player:
-            conversation.open(player.transport)
-            while not conversation.over.wait(_POLL_SECONDS):
-                if self._context.stop.is_set():
-                    return None
+
+            def goes_on() -> bool:
                 if failure := player.failure():
-                    raise PlayerError(failure)
+                    raise EvaluatorError(failure)
                 self._beat()
-                health = self._context.health
+                health = context.health
                 health.updated = health.awaited_since = time.monotonic()  # it works, although it does not train
-        if conversation.report is None:
-            raise PlayerError(conversation.failure)
-        return conversation.report
+                return not context.stop.is_set()
+
+            reports = EvaluatorHost(context.name, player.transport).play(plan, [policy], goes_on)
+        return None if reports is None else (plan, reports[0])

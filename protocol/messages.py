@@ -309,16 +309,15 @@ class Welcome:
     seed: int  # for the environments and samples of this incarnation of the actor
     spec: ActorSpec
     epsilon: float = 0.0  # probability with which this actor takes a random action in the end; 0: it does not explore
-    # For an evaluator: sampled episodes to play once, at once, with this seed, before it leaves; 0: it plays as the
-    # specification says.
-    confirm_episodes: int = 0
-    confirm_seed: int = 0
+    # For an evaluator: episodes to play at once with each policy, with this seed; 0: as the specification says.
+    play_episodes: int = 0
+    play_seed: int = 0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.epsilon <= 1.0:
             raise ValueError(f"epsilon is {self.epsilon}: it must be from 0 to 1")
-        if self.confirm_episodes < 0 or self.confirm_seed < 0:
-            raise ValueError("confirm_episodes and confirm_seed must be 0 or more")
+        if self.play_episodes < 0 or self.play_seed < 0:
+            raise ValueError("play_episodes and play_seed must be 0 or more")
 
     def entropy(self, actor: str) -> int:
         """Return 128 bits of the seed and the actor's name: seeds of 32 bits may be equal for two actors."""

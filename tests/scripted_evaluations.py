@@ -54,16 +54,16 @@ class ScriptedLearner:
     def __init__(self, network: MemoryNetwork, spec: RunSpec, epoch: int = 1) -> None:
         self.transport = MemoryTransport(network)
         self.epoch, self.spec = epoch, spec
-        self.confirm_episodes, self.confirm_seed = 0, 0
+        self.play_episodes, self.play_seed = 0, 0
         self.joins: queue.Queue[Join] = queue.Queue()
         self.received: queue.Queue[Request] = queue.Queue()
         self.present: list[str] = []
         self.transport.serve(keys.evaluations("r", "*"), self.received.put)
         self.transport.serve(keys.program("r", "*"), self._program)
         self.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
-        self.transport.serve(keys.join("r", "*"), self._join)
+        self.transport.serve(keys.join("r", "*"), self.answer_join)
 
-    def _join(self, request: Request) -> None:
+    def answer_join(self, request: Request) -> None:
         message = decode(request.payload, Limits())
         assert isinstance(message, Join)
         self.joins.put(message)
@@ -72,8 +72,8 @@ class ScriptedLearner:
             learner_epoch=self.epoch,
             seed=1,
             spec=self.spec.for_actors(),
-            confirm_episodes=self.confirm_episodes,
-            confirm_seed=self.confirm_seed,
+            play_episodes=self.play_episodes,
+            play_seed=self.play_seed,
         )
         request.reply(encode(welcome))
 

@@ -1,8 +1,11 @@
 """Whole episodes played with a policy, and their returns. No network, no threads."""
 
 import os
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TextIO
 
 import numpy as np
 
@@ -14,6 +17,7 @@ from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import Spaces, unfit_number
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, EvaluationSpec
+from daedalus.protocol.texts import short_number
 
 _Components = dict[str, np.ndarray]
 
@@ -109,6 +113,7 @@ def _repeated(rows: np.ndarray, repeats: int) -> np.ndarray:
 _MAX_ENVIRONMENTS = 100
 _SEEDS = 2**30  # seeds of environments are below it plus the number of episodes: every backend takes them
 _LONGEST = EvaluationSpec().max_episode_env_steps
+PROGRESS_SECONDS = 5.0  # between two lines
 _ENVIRONMENTS_PER_PROCESSOR = 4  # if each is a process: enough to keep a processor busy, and few enough to start fast
 
 
@@ -141,8 +146,48 @@ def cut_note(cut: int, episodes: int, longest: int, *, sampled: bool) -> str:
     )
 
 
-def _no_progress(finished: int, mean: float) -> bool:
+def no_progress(finished: int, mean: float) -> bool:
+    """Show nothing, and let the evaluation go on."""
     return False
+
+
+class EvaluationStoppedError(Exception):
+    """Error of an evaluation that was stopped before its last episode ended."""
+
+
+class EvaluationProgress:
+    """Callback that reports progress every few seconds, and raises EvaluationStoppedError when `stop` is set.
+
+    On a terminal it rewrites one line.
+    """
+
+    def __init__(self, stream: TextIO, episodes: int, longest: int, stop: threading.Event) -> None:
+        self._stream, self._episodes, self._longest, self.stop = stream, episodes, longest, stop
+        self._terminal = stream.isatty()
+        self._due = time.monotonic() + PROGRESS_SECONDS
+        self._rewriting = False
+
+    def __call__(self, finished: int, mean: float) -> bool:
+        """Show how many episodes have finished, and their mean return. Return False: the evaluation goes on."""
+        if self.stop.is_set():
+            raise EvaluationStoppedError
+        if time.monotonic() < self._due:
+            return False
+        self._due = time.monotonic() + PROGRESS_SECONDS
+        so_far = (
+            f", mean return {short_number(mean)}" if finished else f" (each is cut after {self._longest:,} env_steps)"
+        )
+        line = f"evaluation: {finished} of {self._episodes} episodes{so_far}"
+        self._stream.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
+        self._stream.flush()
+        self._rewriting = self._terminal
+        return False
+
+    def end(self) -> None:
+        """Clear the rewritten line."""
+        if self._rewriting:
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()
 
 
 def play_episodes(
@@ -153,7 +198,7 @@ def play_episodes(
     *,
     sampled: bool,
     longest: int = _LONGEST,
-    progress: Callable[[int, float], bool] = _no_progress,
+    progress: Callable[[int, float], bool] = no_progress,
 ) -> Evaluation:
     """Play `episodes` episodes and return their results, in the order of their numbers.
 

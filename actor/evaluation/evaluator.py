@@ -1,24 +1,31 @@
 """The evaluator: an actor that evaluates the learner's newest policy and reports the returns.
 
-It does so on a schedule, or once, for a learner that waits for the confirmation of its target.
+It does so on a schedule, or at once with each policy, for the process of this host that has started it.
 
 It contributes nothing to the training data. The only threads are the caller's and the transport's.
 """
 
 import itertools
 import logging
-import math
 import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.vector_environments import VectorEnvironment
-from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
+from daedalus.actor.errors import LearnerLostError
+from daedalus.actor.evaluation.episodes import (
+    EvaluationProgress,
+    cut_note,
+    environments_for,
+    no_progress,
+    play_episodes,
+)
 from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.actor.session.conversation import Conversation, Query, RunOverError, Steps, Wait, Work
 from daedalus.actor.session.session_thread import SessionThread
@@ -41,7 +48,6 @@ from daedalus.transport.interface import Transport
 _logger = logging.getLogger(__name__)
 
 _DEFAULT_SECONDS = 60.0  # between evaluations, unless the run says otherwise
-_PROGRESS_SECONDS = 5.0  # between two lines about the episodes that a learner waits for
 _UPDATE_SECONDS = 60.0  # for a query that is answered between two updates, which may be slow
 
 
@@ -90,7 +96,7 @@ class Evaluator:
         self._config, self._stop, self._on_join = config, stop, on_join
         self._session = EvaluatorSession(config, own_origin(transport))
         self._thread = SessionThread(self._session, transport, stop)
-        self._warned_of_cuts, self._show_at = False, math.inf
+        self._warned_of_cuts = False
 
     def run(self) -> bool:
         """Evaluate until `stop` or until the run is over; return whether the run finished.
@@ -116,10 +122,10 @@ class Evaluator:
         """Evaluate the policies of one learner epoch until it ends."""
         self._thread.call(self._session.end_waiting)
         self._on_join(welcome)
-        spec, wanted, confirms = welcome.spec, welcome.spec.evaluation, welcome.confirm_episodes > 0
-        interval = wanted.seconds or _DEFAULT_SECONDS
-        if confirms:
-            wanted = wanted.model_copy(update={"episodes": welcome.confirm_episodes, "actions": "sampled"})
+        spec, wanted, at_once = welcome.spec, welcome.spec.evaluation, welcome.play_episodes > 0
+        interval = 0.0 if at_once else wanted.seconds or _DEFAULT_SECONDS
+        if at_once:
+            wanted = wanted.model_copy(update={"episodes": welcome.play_episodes})
         else:
             plan = f"{wanted.episodes} {wanted.actions} episodes of {spec.environment.id} every {interval:g} s"
             _logger.info("run %r: %s", welcome.run, plan)
@@ -127,18 +133,20 @@ class Evaluator:
         count = environments_for(wanted.episodes, environment, spec.collection)
         environments = make_environments(environment, count, modules=self._config.modules, one_episode=True)
         try:
-            due = time.monotonic() + (0.0 if confirms else interval)
+            if at_once:  # nobody else checks that the policy fits the environment
+                join = replace(self._session.join, spaces=environments.spaces, environments=count)
+                try:
+                    self._thread.run(self._session.confirm(welcome, join))
+                except LearnerLostError:
+                    return  # there is something else to play by now
+            due = time.monotonic() + interval
             for number in itertools.count():
                 self._thread.run(self._session.pause(due - time.monotonic()))
                 due = time.monotonic() + interval
                 # An actor's seed is made of other numbers: no episode of training is evaluated here.
                 seed = int(np.random.SeedSequence([welcome.seed, spec.seed, number]).generate_state(1)[0])
-                if confirms:
-                    seed, self._show_at = welcome.confirm_seed, time.monotonic() + _PROGRESS_SECONDS
-                if not self._evaluate(welcome, wanted, environments, seed):
+                if not self._evaluate(welcome, wanted, environments, welcome.play_seed if at_once else seed):
                     return
-                if confirms:
-                    raise RunOverError("the new episodes are played", finished=True)
         finally:
             environments.close()
 
@@ -152,22 +160,28 @@ class Evaluator:
             return False
         runtime = OnnxRuntime(program, self._stop)
         runtime.load(snapshot.weights)
-        sampled = wanted.actions == "sampled"
+        sampled, longest = wanted.actions == "sampled", wanted.max_episode_env_steps
+        shown = EvaluationProgress(sys.stderr, wanted.episodes, longest, self._stop)
+        progress = shown if welcome.play_episodes else no_progress  # whoever has started this evaluator waits
+
+        def raise_if_ended(finished: int, mean: float) -> bool:
+            self._thread.call(self._session.check_over)  # also in the middle of an episode
+            return progress(finished, mean)
+
         evaluation = play_episodes(
             runtime,
             environments,
             wanted.episodes,
             seed,
             sampled=sampled,
-            longest=wanted.max_episode_env_steps,
-            progress=self._raise_if_ended,
+            longest=longest,
+            progress=raise_if_ended,
         )
         _logger.info("policy version %d: return %s", snapshot.policy_version, short_number(evaluation.returns.mean()))
         note = ""
         if evaluation.cut.any():
-            cut, longest = int(evaluation.cut.sum()), wanted.max_episode_env_steps
-            note = cut_note(cut, wanted.episodes, longest, sampled=sampled)
-            if not self._warned_of_cuts:
+            note = cut_note(int(evaluation.cut.sum()), wanted.episodes, longest, sampled=sampled)
+            if not (self._warned_of_cuts or welcome.play_episodes):  # whoever asked at once shows the note
                 self._warned_of_cuts = True
                 _logger.warning("%s", note)
         report = EvaluationReport(
@@ -180,13 +194,3 @@ class Evaluator:
         )
         self._thread.run(self._session.report(report))
         return True
-
-    def _raise_if_ended(self, finished: int, mean: float) -> bool:
-        """End an evaluation with the run or on `stop`, in the middle of an episode: called after every step."""
-        self._thread.call(self._session.check_over)
-        if time.monotonic() >= self._show_at:
-            self._show_at += _PROGRESS_SECONDS
-            so_far = f", mean return {short_number(mean)}" if finished else ""
-            sys.stderr.write(f"confirmation: {finished} new episodes have ended{so_far}\n")
-            sys.stderr.flush()
-        return False

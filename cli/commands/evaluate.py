@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO, get_args
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.evaluation.episodes import EvaluationStoppedError
 from daedalus.actor.evaluation.video import VideoError
 from daedalus.cli.arguments import add_allow_module, add_logging, allowing, command_parser
-from daedalus.launch.evaluation import EPISODES, EvaluationOptions, EvaluationStoppedError, run_evaluation
+from daedalus.launch.evaluation import EPISODES, EvaluationOptions, run_evaluation
 from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
-    exit_with_parent,
     open_standard_streams,
     stop_on_signals,
 )
@@ -122,7 +122,6 @@ def parser() -> argparse.ArgumentParser:
     )
     _add_watching(options)
     add_logging(options)
-    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options
 
 
@@ -171,8 +170,6 @@ def main(
     if arguments.record and not (arguments.directory / "config.toml").is_file():
         print_error("evaluate", f"--record: {arguments.directory} is not a run directory: it has no config.toml")
         return 2
-    if arguments.exit_with_parent:
-        exit_with_parent(stop)
     try:
         with redirect_stdout(sys.stderr):  # the environment may print
             result = run_evaluation(options, stop, sys.stderr)

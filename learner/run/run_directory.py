@@ -37,6 +37,7 @@ from daedalus.protocol.spec import RunSpec
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
 OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
 OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
+CONFIRMATION_OUTPUT = "confirmation.log"  # of a learner's evaluator, where the launcher writes output.log
 REPORT = "report.html"
 TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run
 _SUPERSEDED = "superseded_by"  # in summary.json: the epoch of the newer learner

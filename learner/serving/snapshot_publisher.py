@@ -196,7 +196,8 @@ class SnapshotPublisher:
         # The answer to queries for the newest snapshot, and its version if it is a snapshot.
         self._snapshot: tuple[bytes, int | None] = (_refusal("not_ready", "the learner has no policy yet"), None)
         self._unchanged = _refusal("not_ready", "the actor holds the newest snapshot")
-        self._program_hash, self._program = "", b""
+        self.offered: Program | None = None
+        self._program = b""  # encoded
         self._ended = False
         self._unpublished_rollouts = 0  # trained on since the last snapshot
         self.version = context.start_version  # the newest published version
@@ -217,7 +218,7 @@ class SnapshotPublisher:
 
     def program(self, name: str) -> bytes:
         """Return the answer to a query for the program with a hash, or for the current program (`*`)."""
-        if not self._program or name not in ("*", self._program_hash):
+        if self.offered is None or name not in ("*", self.offered.hash):
             return _refusal("unknown", f"no program with hash {name[:64]!r}")
         return self._program
 
@@ -243,8 +244,8 @@ class SnapshotPublisher:
 
     def offer_program(self, model: bytes) -> None:
         """Make the policy program available to queries."""
-        self._program_hash = program_hash(model)
-        self._program = encode(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
+        self.offered = Program(hash=program_hash(model), model=np.frombuffer(model, np.uint8))
+        self._program = encode(self.offered)
 
     def publish_if_due(self, policy_version: int, weights: Callable[[], dict[str, np.ndarray]], rollouts: int) -> None:
         """Publish a policy version if enough rollouts were trained on since the last snapshot.
@@ -267,7 +268,14 @@ class SnapshotPublisher:
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
         """Publish a snapshot. It is encoded once, for subscribers and for queries."""
-        snapshot = self.encoded(policy_version, {**weights, **self.extras()})
+        snapshot = encode(
+            Snapshot(
+                learner_epoch=self._context.learner_epoch,
+                policy_version=policy_version,
+                program=self.offered.hash if self.offered else "",
+                weights={**weights, **self.extras()},
+            )
+        )
         if not self._ended:
             self._snapshot = snapshot, policy_version
         self.version, self._unpublished_rollouts = policy_version, 0
@@ -275,17 +283,6 @@ class SnapshotPublisher:
             self._transport.publish(keys.snapshots(self._context.name), snapshot)
         self._context.fleet.pushed_bytes += len(snapshot)
         self._context.counters.snapshots_published += 1
-
-    def encoded(self, policy_version: int, weights: dict[str, np.ndarray]) -> bytes:
-        """Return an encoded Snapshot for the program on offer."""
-        return encode(
-            Snapshot(
-                learner_epoch=self._context.learner_epoch,
-                policy_version=policy_version,
-                program=self._program_hash,
-                weights=weights,
-            )
-        )
 
     def _count_answer(self, request: SnapshotRequest, size: int) -> None:
         """Count an answer to an actor. Any thread may call this method."""

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, link_sealed, remove_sealed
+from daedalus.protocol.spec import EnvironmentSpec
 
 _BEST = re.compile(r"best_(training_)?(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)_(\d{10,})", re.ASCII)
 _KEPT = 3  # of each kind. Scores over few episodes are noisy: with several, the best can be selected over more episodes
@@ -148,3 +151,36 @@ def _score_and_version(directory: Path) -> tuple[float, int]:
     if match is None:
         raise ValueError(f"{directory} is not named like a best checkpoint")
     return float(match[2]), int(match[3])
+
+
+def evaluation_result(
+    checkpoint: Path,
+    policy_version: int,
+    environment: EnvironmentSpec,
+    returns: np.ndarray,
+    lengths: np.ndarray,
+    notes: list[str],
+) -> dict[str, Any]:
+    """Return the result of an evaluation, as `daedalus evaluate --json` and summary.json name it.
+
+    Args:
+      checkpoint: that was evaluated.
+      policy_version: its version.
+      environment: that was played.
+      returns, lengths: of the episodes, [K] each.
+      notes: for a person, such as that episodes were cut.
+    """
+    return {
+        "environment": environment.id,
+        "backend": environment.backend,
+        "checkpoint": str(checkpoint),
+        "best_checkpoint": is_best(checkpoint),
+        "policy_version": policy_version,
+        "episodes": len(returns),
+        "notes": notes,
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "length_mean": float(lengths.mean()),
+    }

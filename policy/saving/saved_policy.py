@@ -93,6 +93,31 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     raise DamagedError(f"{directory} has no readable checkpoint")
 
 
+def candidates(run_directory: Path) -> list[Path]:
+    """Return the checkpoints among which the best is selected after a run. A version may be there twice.
+
+    They are those with the best scores of evaluations and of training episodes, and the newest. Returns an empty list
+    if no checkpoint has a score, and if nobody evaluated and the newest was the best in training: there is nothing to
+    select.
+    """
+    evaluated, trained = best_checkpoints(run_directory), best_in_training(run_directory)
+    newest = checkpoints(run_directory)[:1]
+    return [] if not evaluated and trained[:1] in ([], newest) else [*evaluated, *trained, *newest]
+
+
+def read_candidates(run_directory: Path) -> list[SavedPolicy]:
+    """Return the policies of `candidates`, each version once. Logs a warning for each damaged checkpoint."""
+    found: dict[int, SavedPolicy] = {}
+    for directory in candidates(run_directory):
+        try:
+            policy = read_policy(directory)
+        except DamagedError as error:
+            _logger.warning("damaged checkpoint skipped: %s", error)
+        else:
+            found.setdefault(policy.policy_version, policy)
+    return list(found.values())
+
+
 def _no_checkpoints(directory: Path) -> str:
     if not directory.exists():
         return f"{directory} does not exist: name a run directory or one of its checkpoints"

@@ -15,6 +15,7 @@ from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.actor_config import own_origin
 from daedalus.protocol.messages import Join, Refusal
+from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 JOIN = Join(actor="e", incarnation=7, origin=own_origin(MemoryTransport(MemoryNetwork())))
@@ -58,23 +59,45 @@ def test_evaluator_samples_if_the_run_says_so(network: MemoryNetwork) -> None:
     assert seen - {0.0}
 
 
-def test_new_episodes_that_confirm_a_target_are_played_once_and_at_once(network: MemoryNetwork) -> None:
-    """Sampled ones of the seed that the learner names: each time the same."""
+def test_episodes_are_played_at_once_with_each_policy_until_none_is_left(network: MemoryNetwork) -> None:
+    """Those of the seed that is named: each time the same. The policy of version 4 is told apart by its actions."""
     returns = []
     for seed in (2**34 + 1, 2**34 + 1, 5):
-        learner = ScriptedLearner(network, run_spec(seconds=1000.0))
-        learner.confirm_episodes, learner.confirm_seed = 40, seed
+        spec = run_spec(seconds=1000.0)
+        spec = spec.model_copy(update={"evaluation": spec.evaluation.model_copy(update={"actions": "sampled"})})
+        learner = ScriptedLearner(network, spec)
+        learner.play_episodes, learner.play_seed = 40, seed
         evaluator = RunningEvaluator(network)
-        snapshot = learner.snapshot(3)
-        snapshot.weights["policy_head.bias"][:] = 0.0  # every action is as probable
-        learner.give(snapshot)
-        report = learner.receive_report()
+        for version in (3, 4):
+            snapshot = learner.snapshot(version)
+            snapshot.weights["policy_head.bias"][:] = 0.0 if version == 3 else [0.0, 99.0, 0.0, 0.0]
+            learner.give(snapshot)
+            report = learner.receive_report()
+            assert (report.policy_version, len(report.returns), report.note) == (version, 40, "")
+            returns.append(report.returns.tolist())
+        learner.give(Refusal(code="finished", reason="all episodes are played"))
         evaluator.join()
         assert evaluator.finished
-        assert (report.policy_version, len(report.returns), report.note) == (3, 40, "")
-        returns.append(report.returns.tolist())
+        assert [each.spaces for each in learner.joins.queue] == [None, SPACES]  # checked before it plays
         learner.transport.close()
-    assert returns[0] == returns[1] != returns[2]
+    assert returns[0] == returns[2] != returns[4]
+    assert returns[1] == returns[3] != returns[0]
+
+
+def test_evaluator_plays_the_next_plan_if_it_was_too_slow_for_the_first(network: MemoryNetwork) -> None:
+    """While it made its environments, others have played all that there was to play."""
+
+    class OfTwoPlans(ScriptedLearner):
+        def answer_join(self, request: Request) -> None:
+            super().answer_join(request)
+            self.epoch = 2
+
+    learner = OfTwoPlans(network, run_spec(seconds=1000.0))
+    learner.play_episodes, learner.play_seed = 2, 5
+    evaluator = RunningEvaluator(network)
+    learner.give(learner.snapshot(3, epoch=2))
+    assert learner.receive_report().learner_epoch == 2
+    evaluator.end(learner)
 
 
 def test_evaluated_episodes_are_not_cut_by_the_no_reward_limit(network: MemoryNetwork) -> None:

@@ -6,17 +6,23 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from saved_runs import CARTPOLE, save
 
 from daedalus.cli.commands import train as train_command
-from daedalus.launch import final_evaluation, local_training, run_choice
+from daedalus.launch import local_training, run_choice
 from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.final_evaluation import FinalEpisodes
 from daedalus.launch.local_run import LocalRun, RunFailedError
 from daedalus.launch.local_training import run_locally
 from daedalus.launch.logs import LogOptions
 from daedalus.launch.supervision import Supervised
 from daedalus.launch.tracker_processes import TrackerProcesses
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorHost
+from daedalus.protocol.messages import EvaluationReport
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
 def test_actor_that_cannot_be_started_ends_the_learner_and_the_actors_before_it(
@@ -88,15 +94,17 @@ def test_sampled_episodes_are_played_only_if_sampled_actions_can_differ(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: str, played: list[str]
 ) -> None:
     """The greedy episodes are worse than training was. The policy of action values is greedy in both."""
-    actions = []
+    actions: list[str] = []
 
-    def play(commands: list[list[str]], *_others: object) -> list[dict[str, Any]]:
-        actions.append("sampled" if "sampled" in commands[0] else "greedy")
-        return [{"return_mean": 1.0, "return_std": 0.0, "episodes": 100, "actions": actions[-1], "notes": []}]
+    def play(_host: EvaluatorHost, plan: EpisodePlan, *_: object) -> list[EvaluationReport]:
+        actions.append(plan.actions)
+        returns, lengths = np.ones(100), np.ones(100, np.int32)
+        report = EvaluationReport(evaluator="e", learner_epoch=1, policy_version=1, returns=returns, lengths=lengths)
+        return [report]
 
-    monkeypatch.setattr(final_evaluation, "play", play)
+    monkeypatch.setattr(EvaluatorHost, "play", play)
+    save(tmp_path, CARTPOLE, 1, training={"algorithm": algorithm})
     (tmp_path / "summary.json").write_text('{"solved": false, "episode_return_mean": 9.0}')
-    spec = RunSpec.model_validate({"environment": {"id": "Any-v0"}, "training": {"algorithm": algorithm}})
-    output = ChildOutput(tmp_path / "output.log", print, print)
-    final_evaluation.evaluate_run(LocalRun(directory=tmp_path, spec=spec, started=0.0), threading.Event(), output)
+    spec = RunSpec.model_validate({"environment": CARTPOLE, "training": {"algorithm": algorithm}})
+    FinalEpisodes(tmp_path, spec, MemoryTransport(MemoryNetwork()), threading.Event()).evaluate()
     assert actions == played

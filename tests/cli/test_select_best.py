@@ -2,44 +2,33 @@
 
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 from saved_runs import CARTPOLE, save, score
 
-from daedalus.cli.commands.evaluate import parser
-from daedalus.launch import final_evaluation as module
-from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.final_evaluation import select_best
+from daedalus.actor.evaluation.episodes import EvaluationStoppedError
+from daedalus.launch.final_evaluation import FinalEpisodes
+from daedalus.learner.run.run_directory import write_json
+from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorHost
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
-@pytest.fixture
-def played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The arguments of the evaluations that the selection among two checkpoints starts."""
+def test_selection_plays_on_the_backend_of_the_training_episodes_that_nothing_else_plays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The final score is measured on another backend: selecting by it would make it the best of several."""
     run = save(tmp_path / "run", CARTPOLE, 1, 2, evaluation={"final_episodes": 20, "final_backend": "envpool"})
     score(run, 300.0, 1)
-    started: list[Any] = []
-
-    def play(commands: list[list[str]], *_: object) -> list[dict[str, float]]:
-        started.extend(parser().parse_args(command) for command in commands)
-        return [{"return_mean": 1.0, "return_std": 0.0} for _ in commands]
-
-    monkeypatch.setattr(module, "play", play)
-    with ChildOutput(tmp_path / "output.log", lambda _: None, lambda _: None) as output:
-        select_best(run, read_policy(checkpoints(run)[0]).spec, ["--episodes", "20"], threading.Event(), output)
-    assert len(started) == 2
-    return started
-
-
-def test_selection_plays_on_the_backend_of_the_training(played: list[Any]) -> None:
-    """The final score is measured on another: selecting by it would make it the best of several."""
-    assert {arguments.backend for arguments in played} == {"gymnasium"}
-
-
-def test_selection_does_not_play_the_episodes_of_the_final_evaluation_or_of_training(played: list[Any]) -> None:
-    (seed,) = {arguments.seed for arguments in played}
-    assert seed not in (1, 1 + 2**32)  # of the run; of the final evaluation, which is the default of the command
+    write_json(run / "summary.json", {})
+    plans: list[EpisodePlan] = []
+    monkeypatch.setattr(EvaluatorHost, "play", lambda _self, plan, *_: plans.append(plan))
+    spec, transport = read_policy(checkpoints(run)[0]).spec, MemoryTransport(MemoryNetwork())
+    with pytest.raises(EvaluationStoppedError):
+        FinalEpisodes(run, spec, transport, threading.Event()).evaluate()
+    (plan,) = plans
+    assert (plan.environment.backend, plan.episodes, plan.actions) == ("gymnasium", 20, "greedy")
+    assert plan.seed not in (1, 1 + 2**32, 1 + 2**34)  # of the run, of the final evaluation, of the confirmation
 
 
 def test_default_seed_of_an_evaluation_is_apart_from_that_of_its_run(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ from daedalus.analysis.recorded_run import read_record
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.commands.train import report as report_of
 from daedalus.launch.child_output import ChildOutput
-from daedalus.launch.final_evaluation import EvaluationFailedError, evaluate_run
-from daedalus.launch.local_run import LocalRun
+from daedalus.launch.local_run import LocalRun, RunStoppedError
+from daedalus.launch.local_training import evaluate_run
 from daedalus.learner.run.run_directory import create, read_json, write_config, write_json
 from daedalus.learner.target_confirmation import confirmation
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
@@ -338,6 +338,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     score(run, 77.0, 4)
     (run / "checkpoints" / "0000000005").rename(tmp_path / "no newer one")
     spec = read_policy(run / "checkpoints" / "best_77.0_0000000004").spec
+    write_config(run, spec)
     write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
     summary = evaluate_run(local_run, threading.Event(), output)
@@ -372,6 +373,7 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
     score(run, 499.0, worst)
     write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / f"{best:010d}").spec
+    write_config(run, spec)
     newest = max(version for version in (1, 2, 3) if version != worst)
     evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event(), output)
     evaluation = read_json(run / "summary.json")["evaluation"]
@@ -389,6 +391,7 @@ def test_new_sampled_episodes_that_confirmed_the_target_are_reported(tmp_path: P
     solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 1000.5}
     write_json(run / "summary.json", {**solved, "confirmation": confirmation(played, 20.0)})
     spec = read_policy(run / "checkpoints" / "0000000005").spec
+    write_config(run, spec)
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
     summary = evaluate_run(local_run, threading.Event(), output)
     report = report_of(local_run, summary)
@@ -408,6 +411,7 @@ def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_samp
     environment = CARTPOLE.model_copy(update={"no_reward_limit": limit})
     run = save(tmp_path / "run", environment, 5, evaluation={"final_episodes": 10})
     spec = read_policy(run / "checkpoints" / "0000000005").spec
+    write_config(run, spec)
     trained = {"solved": False, "env_steps": 9, "updates": 5, "episode_return_mean": training_mean}
     write_json(run / "summary.json", trained)
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
@@ -435,9 +439,10 @@ def test_the_final_evaluation_ends_when_training_is_stopped(tmp_path: Path, outp
     run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_episodes": 10_000})
     write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / "0000000001").spec
+    write_config(run, spec)
     stopping = threading.Event()
     stopping.set()
-    with pytest.raises(EvaluationFailedError):
+    with pytest.raises(RunStoppedError):
         evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping, output)
     assert not processes_mentioning(str(run))
 
@@ -449,7 +454,7 @@ def test_progress_is_written_to_standard_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1)
-    monkeypatch.setattr("daedalus.launch.evaluation._PROGRESS_SECONDS", 0.0)
+    monkeypatch.setattr("daedalus.actor.evaluation.episodes.PROGRESS_SECONDS", 0.0)
     options = ["--json", "--episodes", "2", "--envs", "1", "--allow-module", "counting_environment"]
     assert main([str(run), *options]) == 0
     captured = capsys.readouterr()

@@ -15,7 +15,6 @@ from building import POLICY, SPACES, make_rollouts, run_context, run_spec
 from log_lines import LINES
 
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.candidates import candidates
 from daedalus.learner.run.heartbeat import HEARTBEAT, Heartbeat
 from daedalus.learner.run.process_resources import reserve_descriptors
 from daedalus.learner.serving.evaluations import Evaluated
@@ -25,7 +24,7 @@ from daedalus.learner.training.checkpoint import load_checkpoint, load_newest
 from daedalus.learner.training.checkpointer import Checkpointer, Saving
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training, keep_if_best
-from daedalus.policy.saving.saved_policy import checkpoints, find_policy, read_policy
+from daedalus.policy.saving.saved_policy import checkpoints, find_policy, read_candidates, read_policy
 from daedalus.policy.saving.sealed import SealedDirectory
 from daedalus.protocol.messages import new_epoch
 from daedalus.protocol.spec import RunSpec, TrainingSpec
@@ -239,7 +238,7 @@ def collapse(run: Run, *returns: float) -> list[str]:
 def test_the_good_weights_of_a_run_that_collapses_without_evaluator_are_kept(run: Run) -> None:
     assert collapse(run, 100.0, 480.0, 300.0) == ["0000000002", "0000000003", "0000000001"]
     assert find_policy(run.directory).policy_version == 2
-    assert [each.policy_version for each in candidates(run.directory)] == [2, 3, 1]
+    assert [each.policy_version for each in read_candidates(run.directory)] == [2, 3, 1]
     assert collapse(run, 490.0, *[9.0] * 8) == [
         "best_training_490.0_0000000004",
         "best_training_480.0_0000000002",
@@ -252,7 +251,7 @@ def test_the_good_weights_of_a_run_that_collapses_without_evaluator_are_kept(run
     assert find_policy(run.directory, newest=True).policy_version == 12
     of = "the newest 100 training episodes"
     assert SealedDirectory(best.directory).content["score"] == {"return_mean": 490.0, "episodes": 100, "of": of}
-    assert [each.policy_version for each in candidates(run.directory)] == [4, 2, 3, 12]
+    assert [each.policy_version for each in read_candidates(run.directory)] == [4, 2, 3, 12]
     keep_if_best(checkpoints(run.directory)[0], -5.0, 12)  # an evaluator has come: its score is not of the same kind
     assert find_policy(run.directory).policy_version == 12
 
@@ -278,7 +277,7 @@ def test_training_returns_of_too_few_episodes_or_of_an_evaluated_run_are_no_scor
     assert collapse(run, 500.0) == []
     run.state.evaluations.heard -= 601.0  # the evaluator was lost
     assert len(collapse(run, 500.0)) == 1
-    assert candidates(run.directory) == []  # the newest is the best
+    assert read_candidates(run.directory) == []  # the newest is the best
 
 
 def test_a_learner_that_resumes_is_newer_than_every_learner_before_its_checkpoint(tmp_path: Path) -> None:

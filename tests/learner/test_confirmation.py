@@ -3,12 +3,13 @@
 import math
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+from plain import vector_spaces
 from processes import LIMIT, until
 
 from daedalus.learner.serving.run_context import RunContext
@@ -119,7 +120,7 @@ class Scene:
     def __init__(self, directory: Path, play: Play) -> None:
         training = TrainingSpec(target_return=475.0, target_episodes=2, seed=7)
         spec = RunSpec(environment=EnvironmentSpec(id="A-v0"), training=training)
-        self.context = RunContext.begin(directory, spec, threading.Event())
+        self.context = RunContext.begin(directory, spec, threading.Event(), spaces=vector_spaces(2, 4))
         self.play, self.starts, self.failure, self.opened = play, True, "", 0
         publisher = SnapshotPublisher(self.context, MemoryTransport(MemoryNetwork()))
         publisher.offer_program(b"program")
@@ -145,7 +146,8 @@ class Scene:
             until(
                 lambda: bool(transport.query(keys.join("*", "p"), encode(Join(actor="p", incarnation=1)), timeout=1.0))
             )
-            (answer,) = transport.query(key, encode(message), timeout=LIMIT)
+            timeout = 1.0 if isinstance(message, Join) else LIMIT
+            (answer,) = transport.query(key, encode(message), timeout=timeout)
             return decode(answer, Limits())
 
         self.play(ask)
@@ -179,7 +181,8 @@ def test_learner_says_what_to_play_and_with_which_policy(tmp_path: Path) -> None
     welcome, snapshot, _ = answers
     assert isinstance(welcome, Welcome)
     assert isinstance(snapshot, Snapshot)
-    assert (welcome.confirm_episodes, welcome.confirm_seed, welcome.run) == (2, 7 + 2**34, scene.context.name)
+    assert (welcome.play_episodes, welcome.play_seed, welcome.run) == (2, 7 + 2**34, scene.context.name)
+    assert welcome.spec.evaluation.actions == "sampled"
     assert (snapshot.policy_version, snapshot.weights["w"].tolist()) == (1, [1.0, 1.0])
     result = scene.confirmation.result
     assert result is not None
@@ -193,6 +196,7 @@ def test_after_an_attempt_training_goes_on_for_as_long_as_it_took(tmp_path: Path
 
     def play(ask: Callable[[str, Any], Message]) -> None:
         threading.Event().wait(0.3)
+        ask(keys.evaluations(scene.context.name, "p"), EvaluationRequest(evaluator="p"))
         ask(keys.evaluations(scene.context.name, "p"), report(value))
 
     scene = Scene(tmp_path, play)
@@ -216,7 +220,8 @@ def test_target_counts_as_reached_if_the_episodes_cannot_be_played(tmp_path: Pat
 
     def play(ask: Callable[[str, Any], Message]) -> None:
         if how == "says":
-            ask(keys.join("*", "p"), failed)
+            with suppress(ValueError):  # no answer
+                ask(keys.join("*", "p"), failed)
         scene.failure = "no display"
 
     scene = Scene(tmp_path, play)
