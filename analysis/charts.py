@@ -1,11 +1,17 @@
-"""Charts of runs for `daedalus plot`, as matplotlib draws them.
+"""Charts of runs: pictures for `daedalus plot`, and SVG for a report. matplotlib draws all of them.
 
 matplotlib is an extra: it is imported when a chart is drawn, and the functions raise ModuleNotFoundError without it.
 """
 
-from collections.abc import Sequence
+import io
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +19,7 @@ from daedalus.analysis.comparison import final_returns, incomparable_returns, tr
 from daedalus.analysis.learning_curves import STD, Series, series_of
 from daedalus.analysis.recorded_run import RETURN
 from daedalus.analysis.run_groups import Group
+from daedalus.analysis.run_results import written
 from daedalus.analysis.statistics import performance_profile, profile_interval
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.regular_files import replacing
@@ -107,10 +114,10 @@ def _figure(width: float, height: float) -> "Figure":
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _draw(axis: "Axes", series: Series, colour: str, label: str) -> None:
+def _draw(axis: "Axes", series: Series, colour: str, label: str = "", style: str = "-") -> None:
     """Draw a line, its band and its marks."""
     marker = "o" if len(series.x) == 1 else ""  # a line of one point shows nothing
-    axis.plot(series.x, series.y, color=colour, label=label, linewidth=1.5, marker=marker, markersize=4)
+    axis.plot(series.x, series.y, style, color=colour, label=label, linewidth=1.5, marker=marker, markersize=4)
     if series.low is not None and series.high is not None:
         axis.fill_between(series.x, series.low, series.high, color=colour, alpha=0.15, linewidth=0)
     if series.marks is not None:
@@ -121,3 +128,116 @@ def _save(figure: "Figure", output: Path) -> None:
     """Write the picture. Raises OSError."""
     with replacing(output) as beside:
         figure.savefig(beside, dpi=110, format=output.suffix[1:])
+
+
+# The charts of a report. Their colours are variables of its style sheet, which has others for a dark page: matplotlib
+# draws with a placeholder for each variable.
+
+SERIES_COLOURS = 8  # further series repeat them with dashes
+_VARIABLES = [*(f"--series-{index + 1}" for index in range(SERIES_COLOURS)), "--muted", "--grid", "--bar", "--panel"]
+_PLACEHOLDERS = {name: f"#0000{number:02x}" for number, name in enumerate(_VARIABLES, start=1)}
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text that the browser writes in its own font
+    "font.family": "DejaVu Sans",
+    "font.size": 11,
+    "xtick.color": _PLACEHOLDERS["--muted"],
+    "ytick.color": _PLACEHOLDERS["--muted"],
+    "axes.labelcolor": _PLACEHOLDERS["--muted"],
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "axes.axisbelow": True,
+    "grid.color": _PLACEHOLDERS["--grid"],
+    "axes.xmargin": 0.0,
+    **{f"axes.spines.{side}": False for side in ("left", "right", "top", "bottom")},
+    **{f"{axis}tick.major.size": 0.0 for axis in "xy"},
+}
+SMALL, LARGE = (520, 220), (1180, 340)  # width and height of a chart, in points
+_METADATA = ("Creator", "Date", "Format", "Type")  # is left out
+_MOST_POINTS = 400
+_MOST_BINS = 40
+
+
+def line_chart(
+    title: str, series: Sequence[Series], *, unit: str, colours: Sequence[int], size: tuple[int, int] = SMALL
+) -> ET.Element:
+    """Return a chart of lines as an element `svg`.
+
+    Args:
+      title: what the lines show; each chart of a page needs a title of its own.
+      series: the lines, each with at least one point.
+      unit: of the horizontal axis.
+      colours: the colour of each line, from 0 on.
+      size: width and height.
+    """
+    ends = "; ".join(
+        f"{each.name + ': ' if len(series) > 1 else ''}from {written(float(each.y[0]))} to {written(float(each.y[-1]))}"
+        for each in series[:SERIES_COLOURS]
+    )
+    with _chart(title, f"{title} by {unit}: {ends}", unit, size) as (axis, svg):
+        for each, colour in zip(series, colours, strict=True):
+            style = "-" if colour < SERIES_COLOURS else "--"
+            _draw(axis, _thinned(each), _PLACEHOLDERS[f"--series-{colour % SERIES_COLOURS + 1}"], style=style)
+        axis.ticklabel_format(useOffset=False)
+    return svg
+
+
+def histogram(title: str, values: np.ndarray, *, marks: Sequence[tuple[str, float]], unit: str) -> ET.Element:
+    """Return a histogram of finite values, with vertical lines at named numbers, as an element `svg`."""
+    named = ", ".join(f"{name} {written(at)}" for name, at in marks)
+    text = f"{title}: {len(values):,} from {written(values.min())} to {written(values.max())}, {named}"
+    counts, edges = np.histogram(values, _edges(values))
+    with _chart(title, text, unit) as (axis, svg):
+        bars, panel = _PLACEHOLDERS["--bar"], _PLACEHOLDERS["--panel"]
+        axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=bars, edgecolor=panel)
+        for index, (_, at) in enumerate(marks):
+            axis.axvline(at, color=_PLACEHOLDERS[f"--series-{index + 2}"], linestyle=("-", "--")[index], linewidth=1.8)
+        axis.ticklabel_format(useOffset=False)
+        axis.locator_params(axis="y", integer=True)
+    return svg
+
+
+@contextmanager
+def _chart(
+    title: str, description: str, unit: str, size: tuple[int, int] = SMALL
+) -> "Iterator[tuple[Axes, ET.Element]]":
+    """Give an axis to draw on, and the element that has the chart at the end."""
+    import matplotlib
+
+    svg, file = ET.Element("svg"), io.StringIO()
+    salt = f"{title} {size}"  # the names in two charts of a page must differ
+    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": salt}):
+        figure = _figure(size[0] / 72, size[1] / 72)  # inches of 72 points, the unit of the SVG
+        axis = figure.subplots()
+        axis.set_xlabel(unit, loc="right")
+        yield axis, svg
+        figure.savefig(file, format="svg", transparent=True, metadata=dict.fromkeys(_METADATA))
+    variables = {colour: f"var({name})" for name, colour in _PLACEHOLDERS.items()}
+    drawn = ET.fromstring(re.sub("#0000[0-9a-f]{2}", lambda found: variables[found[0]], file.getvalue()))
+    for part in drawn.iter():  # in HTML the elements have no namespaces
+        part.tag = part.tag.rpartition("}")[2]
+        part.attrib = {name.rpartition("}")[2]: value for name, value in part.attrib.items()}
+        if part.tag == "g":
+            part.attrib.pop("id", None)  # such as "axes_1", in each chart
+    svg.attrib = {"viewBox": drawn.attrib["viewBox"], "role": "img", "aria-label": description}
+    svg.extend(drawn)
+
+
+def _edges(values: np.ndarray) -> np.ndarray:
+    """Return the edges of bins that hold all values: twice as many as Sturges' rule has, or one for equal values."""
+    low, high = float(values.min()), float(values.max())
+    if high - low <= 1e-12 * max(abs(low), abs(high)):
+        margin = max(0.5, 1e-6 * abs(low))
+        return np.array([low - margin, high + margin])
+    return np.linspace(low, high, min(2 * math.ceil(math.log2(len(values)) + 2), _MOST_BINS) + 1)
+
+
+def _thinned(series: Series) -> Series:
+    """Return a series with at most _MOST_POINTS points: the ends, and between them means of neighbours."""
+    if len(series.x) <= _MOST_POINTS:
+        return series
+    inner = np.linspace(1, len(series.x) - 1, _MOST_POINTS - 2, endpoint=False).astype(np.int64)
+    starts = np.concatenate([[0], inner, [len(series.x) - 1]])
+    counts = np.diff(np.append(starts, len(series.x)))
+    columns = {name: getattr(series, name) for name in ("x", "y", "low", "high")}
+    means = {name: np.add.reduceat(part, starts) / counts for name, part in columns.items() if part is not None}
+    return replace(series, **means)

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from daedalus.analysis.charts import LARGE, SERIES_COLOURS, SMALL, histogram, line_chart
 from daedalus.analysis.comparison import Comparison, cells, compare_groups, header, notes
 from daedalus.analysis.learning_curves import LARGEST, Series, series_of
 from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite
-from daedalus.analysis.report_charts import LARGE, SERIES_COLOURS, SMALL, histogram, line_chart
 from daedalus.analysis.run_groups import Group, environment_of
 from daedalus.analysis.run_results import (
     EpisodeStatistics,

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from daedalus.analysis.charts import INSTALL
 from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS, read_record
 from daedalus.analysis.run_groups import select
 from daedalus.analysis.run_report import comparison_page, run_page
@@ -57,7 +58,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def write_report(directory: Path) -> Path:
-    """Write the report of one run into its directory, and return the path. Raises RunDataError or OSError."""
+    """Write the report of one run into its directory, and return the path.
+
+    Raises RunDataError or OSError, and ModuleNotFoundError without matplotlib.
+    """
     ((group,), *_), _ = select([[directory]], finished=False, columns=[SECONDS], read=read_record)
     replace_text(directory / REPORT, run_page(group, ENV_STEPS))
     return directory / REPORT
@@ -78,6 +82,9 @@ def report(arguments: list[str]) -> int:
             output = parsed.output or Path(REPORT)
     except RunDataError as error:
         print_error("report", error)
+        return 1
+    except ModuleNotFoundError:
+        print_error("report", INSTALL)
         return 1
     try:
         replace_text(output, page)

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import shlex
 import signal
 import sys
 from contextlib import suppress
@@ -306,6 +307,9 @@ def _left_report(directory: Path) -> str:
 
     try:
         return f"report: {write_report(directory)}"
+    except ModuleNotFoundError:
+        shown = shlex.quote(str(directory))
+        return f'for a report with the curves: pip install "daedalus-rl[analysis]", then: daedalus report {shown}'
     except Exception as error:  # the result of a run, and its exit status, do not depend on a report
         return f"no report: {error if isinstance(error, RunDataError) else f'{type(error).__name__}: {error}'}"
 
