@@ -66,6 +66,11 @@ class EnvironmentFactory:
             # The checker costs a tenth of the speed, and warns only authors.
             environment = gymnasium.make(registered, disable_env_checker=True, **kwargs)
         except TypeError as error:
+            if "must inherit from the gymnasium.Env" in str(error):
+                raise EnvironmentSetupError(
+                    f"environment {spec.id} is no gymnasium.Env: if it is a game of PettingZoo's with several agents, add "
+                    "--set environment.backend=pettingzoo"
+                ) from None
             if self.render_mode is None or "keyword argument 'render_mode'" not in str(error):
                 raise
             reason = "its constructor has no argument render_mode"

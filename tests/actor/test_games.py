@@ -167,6 +167,12 @@ def test_faults_of_games_are_named(problem: str, fields: dict[str, Any], text: s
     assert "\n" not in found
 
 
+def test_the_backend_of_a_game_of_one_s_own_is_suggested() -> None:
+    modules = UserModules(frozenset({"test_games"}))
+    report = check_environment(EnvironmentSpec(id="test_games:Duel"), modules, seconds=5.0, env_steps=20)
+    assert "--set environment.backend=pettingzoo" in report.problems[0]
+
+
 def test_one_agent_of_two_may_be_the_policys() -> None:
     report = make("spaces", agents=("red",))
     assert report.problems == ()
