@@ -68,8 +68,8 @@ class EnvironmentFactory:
         except TypeError as error:
             if "must inherit from the gymnasium.Env" in str(error):
                 raise EnvironmentSetupError(
-                    f"environment {spec.id} is no gymnasium.Env: if it is a game of PettingZoo's with several agents, add "
-                    "--set environment.backend=pettingzoo"
+                    f"environment {spec.id} is no gymnasium.Env: if it is a game of PettingZoo's with several agents, "
+                    "add --set environment.backend=pettingzoo"
                 ) from None
             if self.render_mode is None or "keyword argument 'render_mode'" not in str(error):
                 raise
