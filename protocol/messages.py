@@ -35,6 +35,8 @@ class ClientReport:
     rollout_seconds: float = 0.0  # to play one
     waiting_seconds: float = 0.0  # from one to the next: for the learner, the network and newer snapshots
     round_trip_seconds: float = 0.0  # until the answer to a small request of this actor
+    processor_share: float = 0.0  # of one processor, by this process alone
+    memory_bytes: int = 0  # of this process in RAM; 0 if it is unknown
     # Of a client, whose loop its user owns:
     deadlines: int = 0  # of its clock; 0 without a clock
     missed_deadlines: int = 0
@@ -44,7 +46,7 @@ class ClientReport:
     safe_reason: str = ""  # why it plays the safe action now; empty while the policy acts
 
     def __post_init__(self) -> None:
-        for name in ("rollout_seconds", "waiting_seconds", "round_trip_seconds"):
+        for name in ("rollout_seconds", "waiting_seconds", "round_trip_seconds", "processor_share"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be 0 or more")
 
@@ -181,6 +183,8 @@ class ActorStatus(Specification):
     rollout_seconds: float = 0.0
     waiting_seconds: float = 0.0
     round_trip_seconds: float = 0.0
+    processor_share: float = 0.0
+    memory_bytes: int = 0
     silence_limit_seconds: float = 60.0  # `seconds_since_seen` above it is unusual for this actor
     drained_by: str = ""  # who ordered it to leave; empty if nobody did
 
@@ -257,6 +261,8 @@ class RunStatus(Specification):
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
     updates_per_batch: int = 1  # by which a policy lag in updates is one in batches
+    processor_share: float = 0.0  # of one processor, by the learner's process; memory_bytes is its size in RAM
+    memory_bytes: int = 0
     agent_steps: int | None = None  # learned from, of the agents of a game; None: one agent acts in each env_step
     bottleneck: str = ""  # what the run waits for, in one line for a person; empty if it is not known yet
     learning_share: float = 0.0  # of the time in which the learner computes updates

@@ -22,6 +22,7 @@ from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Welcome
 from daedalus.protocol.spec import UnsupportedRunError
 from daedalus.transport.interface import Transport
+from daedalus.transport.process_usage import UsageMeter
 
 _logger = logging.getLogger(__name__)
 
@@ -51,6 +52,7 @@ class ActorService:
         self._config, self._stop, self._on_join = config, stop, on_join
         self._collector = collector or EnvironmentCollector(config.environments, config.modules)
         self._session = ActorSession(config, own_origin(transport), report)
+        self._session.reports.usage = UsageMeter().measure
         self._thread = SessionThread(self._session, transport, stop)
         self._upload_maker: UploadMaker = RolloutUploadMaker()  # what is uploaded of the rollouts
 

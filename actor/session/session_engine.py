@@ -181,7 +181,7 @@ class ActorSession(PolicySession):
         self._schedule = FetchSchedule()
         self._pace, self._is_filling = Pace(), False  # whether a client fills a rollout
         pause = ACTOR_PAUSE_SECONDS if report is None else CLIENT_PAUSE_SECONDS
-        self._reports = Reports(lambda: self._pace.added_to(self._counts(), self.now), pause)
+        self.reports = Reports(lambda: self._pace.added_to(self._counts(), self.now), pause)
         self._is_fetch_due = False  # in the rollout that is being played
         self._played_epoch = -1  # of the learner that has the rollouts in flight
         self._loaded_version = -1  # the policy version that the actor plays
@@ -236,7 +236,7 @@ class ActorSession(PolicySession):
         self.act(*self.uploads.take_due(self.now))
         yield from super().between()
         # An actor that waits for the learner is well. A client is if its loop makes rows.
-        self.act(*self._reports.take_due(self.run, self.now, repeats=not self._is_filling))
+        self.act(*self.reports.take_due(self.run, self.now, repeats=not self._is_filling))
         confirm_at = self._confirmation_due()
         if confirm_at is None:
             return
@@ -249,7 +249,7 @@ class ActorSession(PolicySession):
     def due_times(self) -> list[float | None]:
         """See PolicySession."""
         in_flight_at = self.uploads.in_flight.next_due()
-        return [*super().due_times(), self.leave_by, in_flight_at, self._reports.next_at, self._confirmation_due()]
+        return [*super().due_times(), self.leave_by, in_flight_at, self.reports.next_at, self._confirmation_due()]
 
     def _confirmation_due(self) -> float | None:
         """Return when to ask whether the policy is the newest; None if its age does not matter."""
@@ -265,7 +265,7 @@ class ActorSession(PolicySession):
         spaces, count = yield Prepare(welcome)
         self.feed.begin()
         self.act(WatchPresence(keys.learner(welcome.run)))
-        self._reports.begin()
+        self.reports.begin()
         welcome = yield from self.confirm(welcome, replace(self.join, spaces=spaces, environments=count))
         spec = welcome.spec
         self._pace.join(spec.collection.rollout_length)
@@ -390,14 +390,14 @@ class ActorSession(PolicySession):
         """
         self._pace.begin_row(now)
         self._is_fetch_due = self._schedule.is_due(now)
-        return self._is_fetch_due or self.leave_by is not None or now >= self._reports.next_at
+        return self._is_fetch_due or self.leave_by is not None or now >= self.reports.next_at
 
     def act_in_rollout(self) -> None:
         """Request the snapshot of the next rollout if it is due, and report. Raises as `check_over` does."""
         self.check_over()
         if self._is_fetch_due:
             self._fetch_next()
-        self.act(*self._reports.take_due(self.run, self.now))
+        self.act(*self.reports.take_due(self.run, self.now))
 
     def _fetch_next(self) -> None:
         """Request the snapshot of the next rollout, if that can begin at once."""

@@ -256,6 +256,7 @@ class Reports:
     def __init__(self, report: Callable[[], ClientReport], pause: float = CLIENT_PAUSE_SECONDS) -> None:
         """`report` returns the counts so far; `pause` is the time between two reports, in seconds."""
         self._report, self._pause = report, pause
+        self.usage: Callable[[], tuple[float, int]] = lambda: (0.0, 0)  # of the process: see UsageMeter
         self._sent: ClientReport | None = None
         self._round_trips: deque[float] = deque(maxlen=_ROUND_TRIPS)
         self.next_at = 0.0
@@ -274,8 +275,12 @@ class Reports:
         if report == self._sent and not repeats:
             return []
         self._sent = report
+        processor_share, memory_bytes = self.usage()
         # The shortest: the learner's process may be busy for a moment.
-        timed = replace(report, round_trip_seconds=min(self._round_trips, default=0.0))
+        round_trip = min(self._round_trips, default=0.0)
+        timed = replace(
+            report, round_trip_seconds=round_trip, processor_share=processor_share, memory_bytes=memory_bytes
+        )
         on_answer = partial(self._on_answer, now)
         return [Query(keys.reports(run, report.actor), encode(timed), _REPORT_ANSWER_SECONDS, on_answer)]
 

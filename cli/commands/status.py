@@ -262,7 +262,7 @@ def _table(status: RunStatus) -> list[str]:
         f"  actors: {status.actors_alive:,} alive, {status.actors_quarantined:,} quarantined, {status.actors_gone:,} "
         f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
-        f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
+        f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}{_usage(status)}",
         *([f"  last order at {status.last_order}"] if status.last_order else []),
         *_actor_table(status),
         *_missing_actors(status),
@@ -291,11 +291,22 @@ _COLUMNS: dict[str, _Cell] = {
     "busy": lambda actor, _: f"{_busy_share(actor):.0%}",
     "accepted": lambda actor, _: f"{actor.rollouts_accepted:,}",
     "missed": lambda actor, _: f"{actor.rollouts_missed:,}" if actor.rollouts_missed else "-",
+    "cpu": lambda actor, _: f"{actor.processor_share:.0%}" if actor.processor_share else "-",
+    "MB": lambda actor, _: f"{actor.memory_bytes / 1e6:,.0f}" if actor.memory_bytes else "-",
     "MB/h up": lambda actor, _: f"{actor.bytes_up_per_hour / 1e6:,.0f}",
     "down": lambda actor, _: f"{actor.bytes_down_per_hour / 1e6:,.0f}{'c' if actor.compact_snapshots else ''}",
 }
 _LEFT = ("actor", "state")  # columns of words
-_LEAST_IMPORTANT = ("down", "MB/h up", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy", "waits")
+_LEAST_IMPORTANT = (
+    *("down", "MB/h up", "cpu", "MB", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy", "waits"),
+)
+
+
+def _usage(status: RunStatus) -> str:
+    """Return what the learner uses of its machine, or an empty text."""
+    if not status.memory_bytes:
+        return ""
+    return f"; the learner uses {status.processor_share:.1f} processors, {status.memory_bytes / 1e6:,.0f} MB"
 
 
 def _state(actor: ActorStatus) -> str:

@@ -10,7 +10,7 @@ const KNOWN = new Set(`actor host software address alive quarantined lives secon
   env_steps_per_second rollouts_accepted rollouts_rejected rollouts_missed busy_answers policy_lag compact_snapshots
   bytes_up_per_hour bytes_down_per_hour rows silence_limit_seconds`.split(/\s+/));
 
-const TITLES = { epsilon: "Exploration", rollout_seconds: "Rollout (s)", waiting_seconds: "Waits (s)", round_trip_seconds: "Trip (s)" };
+const TITLES = { epsilon: "Exploration", rollout_seconds: "Rollout (s)", waiting_seconds: "Waits (s)", round_trip_seconds: "Trip (s)", processor_share: "Processors", memory_bytes: "Memory (bytes)" };
 
 const stateOf = (actor) => (actor.quarantined ? "quarantined" : actor.alive ? "alive" : "gone");
 const sum = (values) => values.reduce((total, value) => total + value, 0);

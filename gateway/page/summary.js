@@ -108,6 +108,7 @@ export class Summary {
     this.#tile("Policy lag", lag, `${inUpdates ? `${inUpdates}, ` : ""}mean of the newest batches`);
     const absent = [[status.actors_quarantined, "quarantined"], [status.actors_gone, "gone"]];
     const others = absent.filter(([count]) => count).map(([count, what]) => `${whole(count)} ${what}`);
+    if (status.memory_bytes) this.#tile("Learner", `${number(status.memory_bytes / 1e6)} MB`, `${percent(status.processor_share)} of a processor`);
     this.#tile("Actors", whole(status.actors_alive), others.join(", ") || "none gone");
     this.#tile("Running for", duration(status.uptime_seconds), saved === null ? "no checkpoint yet" : `checkpoint ${duration(saved)} ago`);
     const rejected = Object.values(status.rollouts_rejected).reduce((sum, count) => sum + count, 0);

@@ -25,6 +25,7 @@ from daedalus.learner.serving.query_responses import page, totals
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.policy.saving.best_checkpoints import set_aside_newer
 from daedalus.protocol.messages import RunStatus
+from daedalus.transport.process_usage import UsageMeter
 
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
@@ -62,6 +63,7 @@ class RunReporter:
         training = context.spec.training
         self._meter = RateMeter(self._counters, context.health.started)
         self._bottleneck = ""  # at the newest row
+        self._usage = UsageMeter()
         self._episode_hint = EpisodeHint(training.env_steps)
         self._learning_hint = LearningHint(training.env_steps, normalizes_rewards=training.normalize_rewards)
 
@@ -166,7 +168,7 @@ class RunReporter:
           now: time on the monotonic clock, in seconds.
         """
         context, spec, counters, fleet = self._context, self._context.spec, self._counters, self._context.fleet
-        rates, health = self._meter.rates, context.health
+        rates, health, usage = self._meter.rates, context.health, self._usage.measure()
         fleet.forget_absent(now)
         return RunStatus(
             run=context.name,
@@ -194,6 +196,8 @@ class RunReporter:
             actors=page(fleet, "", now),
             updates_per_batch=spec.training.updates_per_batch,
             agent_steps=counters.agent_steps if spec.environment.is_game else None,
+            processor_share=usage.processor_share,
+            memory_bytes=usage.memory_bytes,
             bottleneck=self._bottleneck,
             learning_share=rates.learning_share,
             decoding_share=rates.decoding_share,

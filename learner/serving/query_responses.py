@@ -106,6 +106,8 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         rollout_seconds=report.rollout_seconds,
         waiting_seconds=report.waiting_seconds,
         round_trip_seconds=report.round_trip_seconds,
+        processor_share=report.processor_share,
+        memory_bytes=report.memory_bytes,
         silence_limit_seconds=actor.silence_limit,
         drained_by=actor.drained_by,
     )
