@@ -123,7 +123,8 @@ class LearnerService:
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
         self._server.close(self._why_stopped)
-        EventFile(self._context.directory).add(self._context.events.take_new())
+        if self._server.orders.stopped_by:  # else nothing has happened that anybody looks for
+            EventFile(self._context.directory).add(self._context.events.take_new())
         self._server.orders.take_checkpoint()(True, "stopped before the first actor joined: there is nothing to save")
         return Outcome(
             solved=False,

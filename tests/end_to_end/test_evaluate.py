@@ -355,7 +355,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     assert result["evaluation_return_mean"] == evaluation["return_mean"]
     assert result == summary
     report = report_of(local_run, summary)
-    assert " over 3 greedy episodes of the best checkpoint on CartPole-v1 (backend envpool)\n" in report
+    assert " over 3 greedy episodes of the best checkpoint on CartPole-v1 (backend envpool)" in report
 
 
 def _with_metrics(run: Path) -> Path:
