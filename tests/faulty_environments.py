@@ -87,7 +87,7 @@ class Faulty(gymnasium.Env[Any, Any]):
 
     def close(self) -> None:
         if self._fault == "child process":
-            self._child.terminate()
+            self._child.kill()  # a fork may have the handlers of its parent
             self._child.join()
         if self._fault in ("close", "close alone") and self._step:
             time.sleep(3600)
