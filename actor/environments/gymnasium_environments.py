@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from enum import Enum
 from functools import partial
 from typing import Any
 
@@ -27,7 +28,9 @@ from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.actor.environments.wrappers import OfItsSpace
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import USER_STATE
+from daedalus.protocol.texts import bounded_text, printable
 
+_LONGEST_NAME = 24  # characters of the name of an action
 CLOSE_SECONDS = 5.0
 _NEXT_SECONDS = 1.0  # for each further environment that does not return
 
@@ -230,6 +233,18 @@ class GymnasiumEnvironments:
                     if kind == "problem":
                         return EnvironmentSetupError(f"environment {self._name}: {text}")
         return playing_error(self._name, call, error)
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """What the environment calls its choices, by a convention of Atari or of MiniGrid; empty if it does not say."""
+        first = self._environment.envs[0] if isinstance(self._environment, SyncVectorEnv) else None
+        names: Any = ()
+        with suppress(Exception, SystemExit):  # of the user's code
+            if first is not None and first.has_wrapper_attr("get_action_meanings"):
+                names = first.get_wrapper_attr("get_action_meanings")()
+            elif first is not None and isinstance(actions := getattr(first.unwrapped, "actions", None), type(Enum)):
+                names = [action.name for action in actions]
+        return tuple(bounded_text(printable(str(name)), _LONGEST_NAME) for name in names)
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""

@@ -214,6 +214,11 @@ class TransformedEnvironment:
             )
         return np.where(resets, 0.0, rewards)
 
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """What the environment calls its choices; empty if it does not say."""
+        return getattr(self._environments, "action_names", ())
+
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See VectorEnvironment."""
         return self._environments.take_episode_info()

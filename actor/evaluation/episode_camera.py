@@ -1,7 +1,7 @@
 """Episodes played for somebody who watches: a picture of each step, and what the policy makes of it. No network."""
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.rendering import FrameRate
+from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.episodes import RunningEpisodes, refuse_unfit_rewards
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
@@ -58,6 +59,8 @@ class EpisodeCamera:
         self._environments = make_environments(
             environment, 1, modules=modules, render_mode="rgb_array", camera=self._film, one_episode=True
         )
+        known = isinstance(self._environments, TransformedEnvironment) and not environment.action_table
+        self._names = self._environments.action_names if known else ()
         self._longest = spec.evaluation.max_episode_env_steps
         self._random = np.random.default_rng()
 
@@ -89,7 +92,7 @@ class EpisodeCamera:
             refuse_unfit_rewards(rewards, np.zeros(1, np.int64))
             running.observe(observed)
             total += float(rewards[0])
-            facts = action_facts(spaces, choice)
+            facts = action_facts(spaces, choice, self._names)
             yield Moment(
                 picture=self._picture,
                 seconds=self._seconds,
@@ -108,7 +111,7 @@ class EpisodeCamera:
         return joined_noise([neutral_noise(size, 1), draw_noise(size, samples, self._random)])
 
 
-def action_facts(spaces: Spaces, choice: Choice) -> list[dict[str, Any]]:
+def action_facts(spaces: Spaces, choice: Choice, names: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Return what is known of the action, by component.
 
     A discrete one has `choices`: lists of a label, the probability and whether it was taken. The probabilities are
@@ -118,6 +121,7 @@ def action_facts(spaces: Spaces, choice: Choice) -> list[dict[str, Any]]:
     Args:
       spaces: of the run.
       choice: the action taken in row 0, samples in the others.
+      names: of the choices, if the environment has them and one discrete variable.
     """
     facts: list[dict[str, Any]] = []
     sole = len(spaces.actions) == 1
@@ -137,17 +141,19 @@ def action_facts(spaces: Spaces, choice: Choice) -> list[dict[str, Any]]:
             else:
                 found, counts = np.unique(column[1:], return_counts=True)
                 shares = dict(zip(found.tolist(), (counts / counts.sum()).tolist(), strict=True))
-            facts.append({"name": title, "choices": _choices(shares, int(column[0]), space.counts[variable])})
+            known = names if sole and space.counts == (len(names),) else ()
+            facts.append({"name": title, "choices": _choices(shares, int(column[0]), space.counts[variable], known)})
     return facts[:_MOST_SHOWN]
 
 
-def _choices(shares: dict[int, float], taken: int, count: int) -> list[list[Any]]:
+def _choices(shares: dict[int, float], taken: int, count: int, names: Sequence[str]) -> list[list[Any]]:
     """Return the choices in their order; of very many, the most probable ones."""
     shown = range(count)
     if count > _MOST_SHOWN:
         likely = sorted(shares, key=lambda choice: (choice != taken, -shares[choice]))
         shown = sorted(likely[:_MOST_SHOWN])
-    return [[str(choice), round(shares.get(choice, 0.0), 4), choice == taken] for choice in shown]
+    labels = names or range(count)
+    return [[str(labels[choice]), round(shares.get(choice, 0.0), 4), choice == taken] for choice in shown]
 
 
 def jpeg(picture: np.ndarray) -> bytes:

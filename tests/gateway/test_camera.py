@@ -19,6 +19,8 @@ from processes import LIMIT
 from scripted_learner import POLICY, SPEC, Policy
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
 from daedalus.gateway.learner_link import NewestPolicy
 from daedalus.gateway.watching import camera as camera_module
@@ -27,7 +29,7 @@ from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.messages import Snapshot, Welcome
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 COMMAND = (sys.executable, "-P", "-m", "daedalus.launch.camera_process")
 STATE = np.zeros((3, 0), np.float32)
@@ -65,6 +67,19 @@ def test_probabilities_of_the_only_choice_are_those_of_the_program() -> None:
     choice = Choice({"action": np.array([[1], [0], [1]])}, np.log(np.array([0.75, 0.25, 0.75], np.float32)), STATE)
     (facts,) = action_facts(spaces(action=DiscreteSpace(counts=(3,))), choice)
     assert facts == {"name": "action", "choices": [["0", 0.25, False], ["1", 0.75, True], ["2", 0.0, False]]}
+
+
+def test_choices_have_the_names_that_the_environment_gives() -> None:
+    choice = Choice({"action": np.array([[1], [0]])}, np.log(np.array([0.75, 0.25], np.float32)), STATE)
+    two = spaces(action=DiscreteSpace(counts=(2,)))
+    (facts,) = action_facts(two, choice, ("left", "right"))
+    assert facts["choices"] == [["left", 0.25, False], ["right", 0.75, True]]
+    (facts,) = action_facts(two, choice, ("left", "stay", "right"))  # they are of other actions
+    assert facts["choices"] == [["0", 0.25, False], ["1", 0.75, True]]
+    environments = make_environments(EnvironmentSpec(id="MiniGrid-Empty-5x5-v0", leave_out=("mission",)), 1)
+    environments.close()
+    assert isinstance(environments, TransformedEnvironment)
+    assert environments.action_names[:3] == ("left", "right", "forward")
 
 
 def test_probabilities_of_several_variables_are_shares_of_the_samples() -> None:
