@@ -59,8 +59,9 @@ class EpisodeCamera:
         self._environments = make_environments(
             environment, 1, modules=modules, render_mode="rgb_array", camera=self._film, one_episode=True
         )
-        known = isinstance(self._environments, TransformedEnvironment) and not environment.action_table
-        self._names = self._environments.action_names if known else ()
+        played = self._environments
+        known = isinstance(played, TransformedEnvironment) and not environment.action_table
+        self._names = played.action_names if known else ()
         self._longest = spec.evaluation.max_episode_env_steps
         self._random = np.random.default_rng()
 
