@@ -60,8 +60,9 @@ class EpisodeCamera:
             environment, 1, modules=modules, render_mode="rgb_array", camera=self._film, one_episode=True
         )
         played = self._environments
-        known = isinstance(played, TransformedEnvironment) and not environment.action_table
-        self._names = played.action_names if known else ()
+        self._names: tuple[str, ...] = ()
+        if isinstance(played, TransformedEnvironment) and not environment.action_table:
+            self._names = played.action_names
         self._longest = spec.evaluation.max_episode_env_steps
         self._random = np.random.default_rng()
 
