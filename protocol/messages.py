@@ -145,7 +145,7 @@ def starts_of(epoch: int) -> int:
 
 
 MAX_EVENTS = 100  # that a learner keeps
-PAGE_ACTORS = 64  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
+PAGE_ACTORS = 60  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
 
 
 class ActorStatus(Specification):

@@ -1,7 +1,6 @@
 """What a process uses of its machine, as actors report it to the learner, and the learner in its status."""
 
-import os
-import sys
+import mmap
 import time
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ class Usage(NamedTuple):
     """The use of one process, without that of processes that it started."""
 
     processor_share: float  # of one processor, since the last measurement: 1.5 is one and a half
-    memory_bytes: int  # in RAM; 0 if the system does not tell
+    memory_bytes: int  # in RAM; 0 where the system is not Linux
 
 
 class UsageMeter:
@@ -30,11 +29,8 @@ class UsageMeter:
 
 
 def _memory_bytes() -> int:
-    if sys.platform == "linux":
-        with open("/proc/self/statm", "rb") as file:  # in pages: all, resident, ...
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     try:
-        import resource
-    except ModuleNotFoundError:  # Windows
+        with open("/proc/self/statm", "rb") as file:  # of Linux, in pages: all, resident, ...
+            return int(file.read().split()[1]) * mmap.PAGESIZE
+    except (OSError, ValueError, IndexError):
         return 0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # the most so far, in bytes on macOS

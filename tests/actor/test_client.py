@@ -219,6 +219,8 @@ def test_client_reports_what_it_counts(learner: ScriptedLearner) -> None:
             rows=4,
             rollout_seconds=report.rollout_seconds,
             round_trip_seconds=report.round_trip_seconds,
+            processor_share=report.processor_share,
+            memory_bytes=report.memory_bytes,
             deadlines=2 + missed,
             missed_deadlines=missed,
             overridden_actions=1,

@@ -267,7 +267,10 @@ _OWN: dict[type, st.SearchStrategy[Any]] = {
     Join: inferred(Join, spaces=st.none() | spaces, environments=st.integers(0, 4096)),
     Welcome: inferred(Welcome, epsilon=st.floats(0, 1), spec=run_specs.map(RunSpec.for_actors)),
     ClientReport: inferred(
-        ClientReport, **dict.fromkeys(("rollout_seconds", "waiting_seconds", "round_trip_seconds"), st.floats(0, 1e9))
+        ClientReport,
+        **dict.fromkeys(
+            ("rollout_seconds", "waiting_seconds", "round_trip_seconds", "processor_share"), st.floats(0, 1e9)
+        ),
     ),
     Program: inferred(Program, model=programs),
     Rollout: rollouts(),
