@@ -23,7 +23,7 @@ class OrderError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Operator:
-    """Whoever gives orders over one transport."""
+    """An operator who gives orders over one transport."""
 
     name: str = keys.NO_OPERATOR  # in the certificate
     host: str = ""

@@ -158,6 +158,12 @@ class _SimultaneousGame:
         truncated: Mapping[str, bool],
         infos: Mapping[str, Any],
     ) -> list[Outcome]:
+        missing = [agent for agent in agents if agent not in observations]
+        if missing:
+            raise EnvironmentSetupError(
+                f"there is no observation of {missing[0]} after its action: return one of each agent that acted, "
+                "also of those that leave with this step"
+            )
         self._seen = {
             agent: (observations[agent], infos.get(agent, {})) for agent in agents if agent not in self._agents
         }
@@ -179,7 +185,7 @@ class GameEnvironments:
     """A BackendEnvironments of E seats: those of each copy of a game side by side, copy after copy."""
 
     def __init__(self, name: str, copies: Sequence[Any], spec: EnvironmentSpec, seats: tuple[str, ...]) -> None:
-        """Construct from PettingZoo environments, and reset the first: only a reset shows whether there are masks.
+        """Construct from PettingZoo environments, and reset them: only a reset shows whether there are masks.
 
         Args:
           name: id of the game, for errors.

@@ -210,6 +210,8 @@ def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
     Atari games of the other backends have another name there, repeat actions unless told not to, and begin always in
     the same way. Of their `kwargs` those are kept that change the game itself.
     """
+    if spec.is_game:  # gymnasium has none
+        return spec.as_evaluated()
     evaluated = spec.as_evaluated("gymnasium")
     if spec.backend == "gymnasium":
         return evaluated

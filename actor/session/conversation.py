@@ -189,7 +189,7 @@ class Conversation:
                 self._ordered(message)
 
     def _ordered(self, message: OrderRequest) -> None:
-        """Obey an order to this actor while it waits for a run."""
+        """Carry out an order to this actor while it waits for a run."""
         this = self.join.actor, self.join.incarnation
         if message.order == "drain" and (message.actor, message.incarnation) == this and self._waits:
             host = f" at {bounded_text(message.host, MAX_NAME)}" if message.host else ""

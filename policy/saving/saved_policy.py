@@ -97,8 +97,8 @@ def candidates(run_directory: Path) -> list[Path]:
     """Return the checkpoints among which the best is selected after a run. A version may be there twice.
 
     They are those with the best scores of evaluations and of training episodes, and the newest. Returns an empty list
-    if no checkpoint has a score, and if nobody evaluated and the newest was the best in training: there is nothing to
-    select.
+    where there is nothing to select: if no checkpoint has a score, or if there was no evaluation and the newest
+    checkpoint was the best in training.
     """
     evaluated, trained = best_checkpoints(run_directory), best_in_training(run_directory)
     newest = checkpoints(run_directory)[:1]

@@ -15,6 +15,8 @@ from plain import PlainPolicy
 
 from daedalus.actor.checking.check_report import EnvironmentReport
 from daedalus.actor.checking.play import check_environment
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.learner.run.settings import SettingsError, run_spec
@@ -133,10 +135,8 @@ class Duel(ParallelEnv):
 
     def _seen(self) -> dict[str, np.ndarray]:
         more = 2 if self.problem == "shape" and self.left < 5 else 0
-        return {
-            agent: np.full(self.observation_space(agent).shape[0] + more, 0.5, np.float32)
-            for agent in self.possible_agents
-        }
+        agents = self.agents if self.problem == "no last observation" else self.possible_agents
+        return {agent: np.full(self.observation_space(agent).shape[0] + more, 0.5, np.float32) for agent in agents}
 
     def _info(self) -> dict[str, dict]:
         mask = np.array([0, 0 if self.problem == "no choice" and self.left < 5 else 1], np.int8)
@@ -156,6 +156,7 @@ def test_a_game_is_checked() -> None:
         ("spaces", {}, r"have different spaces \(red; blue\).*environment.agents=\['red'\]"),
         ("", {"agents": ("green",)}, "names 'green', but the agents of test_games:Duel are red, blue"),
         ("shape", {}, "(red|blue) observes .* which is not of its space"),
+        ("no last observation", {}, "no observation of red after its action"),
         ("no choice", {}, "forbids every choice"),
         ("reward", {}, "red has the reward nan: it must be finite"),
         ("raises", {}, "step raises RuntimeError: the table broke"),
@@ -171,6 +172,14 @@ def test_the_backend_of_a_game_of_one_s_own_is_suggested() -> None:
     modules = UserModules(frozenset({"test_games"}))
     report = check_environment(EnvironmentSpec(id="test_games:Duel"), modules, seconds=5.0, env_steps=20)
     assert "--set environment.backend=pettingzoo" in report.problems[0]
+
+
+def test_games_are_not_shown_yet() -> None:
+    spec = as_on_gymnasium(EnvironmentSpec(id="pettingzoo.classic.tictactoe_v3"))
+    with pytest.raises(
+        EnvironmentSetupError, match=r"cannot be shown or filmed yet: pettingzoo\.classic\.tictactoe_v3"
+    ):
+        make_environments(spec, 1, render_mode="rgb_array")
 
 
 def test_one_agent_of_two_may_be_the_policys() -> None:
