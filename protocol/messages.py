@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from daedalus.protocol import keys
+from daedalus.protocol.league import LeagueStatus, Plan
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
@@ -268,6 +269,7 @@ class RunStatus(Specification):
     learning_share: float = 0.0  # of the time in which the learner computes updates
     decoding_share: float = 0.0  # of the time in which the learner decodes rollouts
     last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
+    league: LeagueStatus | None = None  # of a game with opponents
 
     @property
     def fleet_size(self) -> int:
@@ -396,6 +398,28 @@ class SnapshotRequest:
     compact: bool = True
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeagueRequest:
+    """Request of an actor for whom to play, or for the policy of an opponent. Actor -> learner, on `snapshots`.
+
+    Without a `player` the answer is a LeaguePlan, or a Refusal `not_ready` if the actor holds the newest. With one it
+    is the Snapshot of that player, whose program may be another than the run's, or a Refusal `unknown` if it is not
+    kept any more.
+    """
+
+    actor: str
+    player: str = ""  # a kept version, or another run that is an opponent
+    held_revision: int | None = None  # of the plan that the actor holds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeaguePlan:
+    """Whom an actor of a game lets play. Learner -> actor, in answer to a LeagueRequest."""
+
+    learner_epoch: int
+    plan: Plan
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SnapshotPart:
     """Part of an encoded CompactSnapshot, in answer to SnapshotRequest; small, so that it does not delay other traffic.
@@ -514,6 +538,8 @@ Message = (
     | Acknowledgement
     | Snapshot
     | SnapshotRequest
+    | LeagueRequest
+    | LeaguePlan
     | SnapshotPart
     | CompactSnapshot
     | EvaluationRequest

@@ -415,6 +415,43 @@ class LearningSpec(Specification):
         return {**self.policy.user_modules, **self.training.user_modules}
 
 
+class LeagueSpec(Specification):
+    """Opponents of games with several agents: past versions of the policy, and fixed ones. Ratings of all of them.
+
+    The policy plays the agents of one side of a match, and an opponent plays the agents of all others.
+    """
+
+    sides: Annotated[
+        tuple[Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(min_length=1)], ...],
+        Field(max_length=1024),
+    ] = ()
+    """Agents that play together, for each side. Unset: each agent alone if there are two, else all on one side."""
+    past_share: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    """Share of the matches against past versions. Unset: 0.2, or 0 in a game with one side."""
+    opponents: Annotated[
+        dict[Annotated[str, Field(min_length=1, max_length=200)], Annotated[float, Field(ge=0.0, le=1.0)]],
+        Field(max_length=64),
+    ] = Field(default_factory=lambda: {"random": 0.0})
+    """Fixed opponents, each with its share of the matches; 0: it is only rated. `random`, `module:Bot` for your own,
+    another run's directory, or USER/NAME of a policy on the Hub. The rest of the matches is the newest policy's own."""
+    choice: Literal["uniform", "prioritized"] = "uniform"
+    """Which past version to play: any, or more often those that win about half of their matches: in proportion to
+    p (1 - p) of the probability p to beat it."""
+    keep_env_steps: PositiveInt | None = None
+    """Keep a version after this many env_steps. Unset: a fiftieth of `training.env_steps`."""
+    versions: Annotated[int, Field(ge=1, le=256)] = 20
+    """Number of versions to keep. Beyond it, those go that are nearest to their neighbours in env_steps."""
+    rating_share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.01
+    """Share of the matches that are only played to rate the players, and not learned from."""
+    rating_actions: Literal["sampled", "greedy"] = "sampled"
+    """Actions of the policies in rating matches."""
+
+    @property
+    def user_modules(self) -> dict[str, str]:
+        """Settings that name a module as `module:name`, with their values."""
+        return {f"league.opponents.{name}": name for name in self.opponents if ":" in name}
+
+
 class UnsupportedRunError(ValueError):
     """The run has a setting that this release does not know or cannot apply."""
 
@@ -430,6 +467,7 @@ class ActorSpec(Specification):
     collection: CollectionSpec = CollectionSpec()
     evaluation: EvaluatorSpec = EvaluatorSpec()
     algorithm: ActorDemands = ActorDemands()
+    league: LeagueSpec = LeagueSpec()
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1  # of the run
     max_upload_bytes: NaturalInt = 1 << 26  # the learner does not receive larger messages
     # The fields of LearningSpec, unchecked: most actors do not need them, and may not know each encoder and algorithm.
@@ -482,6 +520,8 @@ class RunSpec(Specification):
     """Evaluator beside the actors."""
     service: ServiceSpec = ServiceSpec()
     """How the learner runs as a service."""
+    league: LeagueSpec = LeagueSpec()
+    """Opponents in games with several agents."""
 
     @model_validator(mode="after")
     def _fits_one_message(self) -> "RunSpec":
@@ -540,6 +580,17 @@ class RunSpec(Specification):
         return self
 
     @model_validator(mode="after")
+    def _league_is_of_a_game(self) -> "RunSpec":
+        changed = tuple(changed_fields(self.league, "league."))
+        if changed and not self.environment.is_game:
+            raise ValueError(
+                f"{changed[0]} is for games with several agents (environment.backend=pettingzoo): leave it unset"
+            )
+        if (self.league.past_share or 0.0) + sum(self.league.opponents.values()) > 1.0:
+            raise ValueError("league.past_share and the shares of league.opponents are more than 1 together")
+        return self
+
+    @model_validator(mode="after")
     def _next_action_is_in_the_rollout(self) -> "RunSpec":
         if self.algorithm.next_action and self.collection.rollout_length < 2:
             raise ValueError(
@@ -578,6 +629,7 @@ class RunSpec(Specification):
             collection=self.collection,
             evaluation=_part(EvaluatorSpec, self.evaluation),
             algorithm=_part(ActorDemands, self.algorithm),
+            league=self.league,
             seed=self.training.seed,
             max_upload_bytes=min(self.service.queue_bytes, 2**63 - 1),
         )
@@ -587,7 +639,7 @@ class RunSpec(Specification):
     @property
     def user_modules(self) -> dict[str, str]:
         """Settings that name a module as `module:name`, with their values."""
-        return {**self.environment.user_modules, **self.learner_modules}
+        return {**self.environment.user_modules, **self.league.user_modules, **self.learner_modules}
 
     @property
     def learner_modules(self) -> dict[str, str]:
@@ -597,7 +649,9 @@ class RunSpec(Specification):
     @property
     def actor_modules(self) -> dict[str, str]:
         """Those of `user_modules` that an actor imports: with gradients, also the learner's."""
-        return self.user_modules if self.uploads_gradients else self.environment.user_modules
+        if self.uploads_gradients:
+            return self.user_modules
+        return {**self.environment.user_modules, **self.league.user_modules}
 
     @property
     def learning(self) -> LearningSpec:

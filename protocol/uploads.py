@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from daedalus.protocol.keys import check_name
+from daedalus.protocol.league import Matches
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 # A float32 has no number between 16,777,216 and 16,777,218: results of episodes are exact in float64 alone.
@@ -78,6 +79,8 @@ class Rollout:
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
     # Env_steps of a game with several agents, at most its rows to learn from; None: each of them is one.
     game_steps: int | None = field(default=None, metadata={"sparse": True})
+    # Of a game: how the matches ended that ended in this rollout; None: none did.
+    matches: Matches | None = field(default=None, metadata={"sparse": True})
 
     @property
     def nbytes(self) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 
 from daedalus.protocol.codec import FIRST_VERSION, encode
 from daedalus.protocol.compact import bfloat16, planes
+from daedalus.protocol.league import Plan, PlannedOpponent, PlannedRating
 from daedalus.protocol.messages import (
     Acknowledgement,
     ActorsPage,
@@ -25,6 +26,8 @@ from daedalus.protocol.messages import (
     EventsReport,
     EventsRequest,
     Join,
+    LeaguePlan,
+    LeagueRequest,
     Message,
     MetricsPage,
     MetricsReport,
@@ -169,6 +172,16 @@ MESSAGES: dict[str, Message] = {
     "snapshot_request": SnapshotRequest(actor="wing-1", held_version=33, policy_version=41, part=2),
     "snapshot_request_first": SnapshotRequest(actor="wing-1", held_version=None),
     "snapshot_request_whole": SnapshotRequest(actor="wing-1", held_version=40, compact=False),
+    "league_request": LeagueRequest(actor="wing-1", held_revision=4),
+    "league_request_player": LeagueRequest(actor="wing-1", player="v33"),
+    "league_plan": LeaguePlan(
+        learner_epoch=7,
+        plan=Plan(
+            revision=5,
+            training=(PlannedOpponent(player="v33", weight=0.5), PlannedOpponent(player="my_bots:Greedy", weight=0.5)),
+            rating=(PlannedRating(first="newest", second="random", weight=1.0),),
+        ),
+    ),
     "snapshot_part": SnapshotPart(
         learner_epoch=9, policy_version=41, part=2, parts=3, data=np.arange(11, dtype=np.uint8)
     ),

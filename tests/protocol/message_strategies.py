@@ -7,6 +7,16 @@ import numpy as np
 from hypothesis import strategies as st
 from wire_format import DTYPES, bits
 
+from daedalus.protocol.league import (
+    LeagueStatus,
+    MatchCount,
+    Matches,
+    Plan,
+    PlannedOpponent,
+    PlannedRating,
+    RatedPlayer,
+    Score,
+)
 from daedalus.protocol.messages import (
     ActorsPage,
     ActorsReport,
@@ -18,6 +28,7 @@ from daedalus.protocol.messages import (
     EventsPage,
     EventsReport,
     Join,
+    LeaguePlan,
     Message,
     MetricsPage,
     MetricsReport,
@@ -122,12 +133,39 @@ def few(content: st.SearchStrategy[Any]) -> st.SearchStrategy[tuple[Any, ...]]:
     return st.lists(content, max_size=3).map(tuple)
 
 
+players = st.text(min_size=1, max_size=20)
+shares = st.floats(0, 1)
+plans = st.builds(
+    Plan,
+    revision=counters,
+    training=few(st.builds(PlannedOpponent, player=players, weight=shares)),
+    rating=few(st.builds(PlannedRating, first=players, second=players, weight=shares)),
+)
+matches = st.builds(
+    Matches,
+    counts=few(
+        st.builds(
+            MatchCount,
+            purpose=st.sampled_from(["training", "rating"]),
+            first=players,
+            second=players,
+            side=st.integers(0, 9),
+            wins=counters,
+        )
+    ),
+)
+league_statuses = st.builds(
+    LeagueStatus,
+    players=few(st.builds(RatedPlayer, player=players, rating=floats, deviation=floats, matches=counters)),
+    scores=few(st.builds(Score, first=players, second=players, wins=floats)),
+)
 rejections = st.dictionaries(text, counters, max_size=3)
 actor_statuses = inferred(ActorStatus, rollouts_rejected=rejections)
 statuses = inferred(
     RunStatus,
     rollouts_rejected=rejections,
     problems=few(text),
+    league=st.none() | league_statuses,
     refused_joins=few(inferred(RefusedJoin)),
     actors=few(actor_statuses),
 )
@@ -173,6 +211,7 @@ def rollouts(draw: st.DrawFn) -> Rollout:
             )
         },
         overridden=bits(random, "|b1", shape) if draw(st.booleans()) else None,
+        matches=draw(st.none() | matches),
     )
 
 
@@ -272,6 +311,7 @@ _OWN: dict[type, st.SearchStrategy[Any]] = {
             ("rollout_seconds", "waiting_seconds", "round_trip_seconds", "processor_share"), st.floats(0, 1e9)
         ),
     ),
+    LeaguePlan: inferred(LeaguePlan, plan=plans),
     Program: inferred(Program, model=programs),
     Rollout: rollouts(),
     Gradient: gradients(),

@@ -16,6 +16,7 @@ from daedalus.protocol.spec import (
     CollectionSpec,
     EnvironmentSpec,
     EvaluationSpec,
+    LeagueSpec,
     PolicySpec,
     RunSpec,
     ServiceSpec,
@@ -47,6 +48,7 @@ SECTIONS = {
     "training": (TrainingSpec, {}),
     "evaluation": (EvaluationSpec, {}),
     "service": (ServiceSpec, {}),
+    "league": (LeagueSpec, {}),
 }
 
 
@@ -166,6 +168,16 @@ OUT_OF_RANGE: dict[type[Specification], dict[str, list[Any]]] = {
         "keep_checkpoints": [0],
         "log_seconds": [0.0],
         "queue_megabytes": [0.0],
+    },
+    LeagueSpec: {
+        "sides": [((),)],
+        "past_share": [-0.1, 1.1, math.nan],
+        "opponents": [{"random": 1.1}, {"": 0.1}],
+        "choice": ["newest"],
+        "keep_env_steps": [0],
+        "versions": [0, 257],
+        "rating_share": [0.6],
+        "rating_actions": ["random"],
     },
 }
 
