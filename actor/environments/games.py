@@ -26,11 +26,13 @@ from daedalus.actor.environments.environment_errors import (
     playing_error,
 )
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
+from daedalus.actor.environments.rendering import render_without_display
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
+_SHOWN = ("ansi", "rgb_array")  # render modes, the best first
 _AGENT = "agent"  # component of the observation with environment.agent_ids
 _MOST_NAMES = 6  # of agents in a message
 _MOST_IDLE_TURNS = 100_000  # of agents that the policy does not play, between two turns of its seats
@@ -392,6 +394,20 @@ class GameEnvironments:
             self._others[agent] = LegalActions(self._environments[0].action_space(agent))
         return self._others[agent].sample(_mask(observation, info), self._random[number])
 
+    def render(self) -> str | np.ndarray | None:
+        """Return the first copy as a text or an image [H, W, 3] uint8; None if the games were not made to be shown."""
+        environment = self._environments[0]
+        if getattr(environment, "render_mode", None) not in _SHOWN:
+            return None
+        try:
+            with USER_STATE:
+                shown = environment.render()
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise playing_error(self.name, "render", error) from error
+        if isinstance(shown, str) or (isinstance(shown, np.ndarray) and shown.ndim == 3):
+            return shown
+        return None
+
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""
         return self._episode_info.take()
@@ -414,16 +430,18 @@ def make_games(
     count: int,
     modules: UserModules,
     further: Callable[[tuple[str, ...]], int] = lambda _: 0,
+    *,
+    shown: bool = False,
 ) -> GameEnvironments:
     """Return `count` copies of the game that a specification names, and further ones, as its seats demand.
 
-    Raises EnvironmentSetupError, and what `further` raises.
+    `shown`: they render texts or images, if they can. Raises EnvironmentSetupError, and what `further` raises.
     """
     copies: list[Any] = []
     try:
         while len(copies) < count:
             with creation_errors(spec.id, hint_of_count(len(copies), count)):
-                copies.append(_make(spec, modules))
+                copies.append(_make_shown(spec, modules) if shown else _make(spec, modules))
             if len(copies) == 1:
                 seats = _seats(copies[0], spec)
                 count += further(seats)
@@ -434,7 +452,24 @@ def make_games(
         raise
 
 
-def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
+def _make_shown(spec: EnvironmentSpec, modules: UserModules) -> Any:
+    """Return a game that renders itself as a text or an image if it can: it says so in its metadata."""
+    render_without_display()
+    environment = _make(spec, modules)
+    modes = getattr(environment, "metadata", {}).get("render_modes", ())
+    mode = next((mode for mode in _SHOWN if mode in modes), None)
+    if mode is None or "render_mode" in spec.constructor_kwargs:
+        return environment
+    try:
+        rendered = _make(spec, modules, render_mode=mode)
+    except (Exception, SystemExit) as error:  # of the user's code: its function need not have this argument
+        _logger.warning("environment %s cannot be made with render_mode=%r: %s", spec.id, mode, first_line(error))
+        return environment
+    environment.close()
+    return rendered
+
+
+def _make(spec: EnvironmentSpec, modules: UserModules, **options: Any) -> Any:
     module_name, colon, function = spec.id.partition(":")
     if colon:
         try:
@@ -447,7 +482,7 @@ def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
         function = "env"
     if not callable(make):
         raise EnvironmentSetupError(f"environment {spec.id}: there is no function {function}() that makes the game")
-    environment = make(**spec.constructor_kwargs)
+    environment = make(**{**spec.constructor_kwargs, **options})
     if not hasattr(environment, "possible_agents"):
         raise EnvironmentSetupError(
             f"environment {spec.id} made {type(environment).__name__}, which has no possible_agents: "

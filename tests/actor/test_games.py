@@ -76,7 +76,8 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
             for column in range(rollout.environments):
                 copy = column // agents if column < alone * agents else alone + (column - alone * agents) // side
                 for row in np.flatnonzero(rollout.valid[:, column]):
-                    match, agent, number = key = tuple(int(number) for number in frames[row, column])
+                    match, agent, number = (int(number) for number in frames[row, column])
+                    key = match, agent, number
                     assert (match, number) > last.get(column, (-1, -1))  # in order
                     last[column] = match, number
                     assert (copy, key) not in seen  # none twice
