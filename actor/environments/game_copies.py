@@ -11,7 +11,6 @@ from daedalus.protocol.spec import EnvironmentSpec
 
 _MOST_IDLE_TURNS = 100_000  # of agents without a seat, between two turns of the seats
 
-ActionOf = Callable[[str], Any]  # of the agents that have a seat and must act
 OtherAction = Callable[[str, Any, Any], Any]  # of an agent without a seat, for its observation and info
 
 
@@ -33,8 +32,13 @@ class GameCopy(Protocol):
         """Begin a match, and return what is new for its first agents."""
         ...
 
-    def step(self, action_of: ActionOf) -> list[Outcome]:
-        """Play on until an agent that has a seat has something new. Only actions that are needed are asked for."""
+    @property
+    def turns(self) -> Sequence[str]:
+        """The agents with a seat that must act next."""
+        ...
+
+    def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
+        """Play on with the actions of the agents that must act, until an agent with a seat has something new."""
         ...
 
     @property
@@ -88,10 +92,15 @@ class _TurnGame:
         self._turn = None
         return self._advance()
 
-    def step(self, action_of: ActionOf) -> list[Outcome]:
+    @property
+    def turns(self) -> Sequence[str]:
+        """See GameCopy."""
+        return () if self._turn is None else (self._turn,)
+
+    def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
         """See GameCopy."""
         if self._turn is not None:
-            action, self._turn = action_of(self._turn), None
+            action, self._turn = actions[self._turn], None
             self._environment.step(action)
         return self._advance()
 
@@ -135,23 +144,25 @@ class _SimultaneousGame:
         """See GameCopy."""
         observations, infos = self._environment.reset(seed=seed)
         outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
-        return outcomes or self._until_ours(lambda agent: None)
+        return outcomes or self.step({})
 
-    def step(self, action_of: ActionOf) -> list[Outcome]:
+    @property
+    def turns(self) -> Sequence[str]:
         """See GameCopy."""
-        return self._until_ours(action_of)
+        return [agent for agent in self._environment.agents if agent in self._agents]
 
-    def _until_ours(self, action_of: ActionOf) -> list[Outcome]:
+    def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
+        """See GameCopy."""
         for _ in range(_MOST_IDLE_TURNS):
-            outcomes = self._step_once(action_of)
+            outcomes = self._step_once(actions)
             if outcomes or self.is_over:
                 return outcomes
         raise _idle()
 
-    def _step_once(self, action_of: ActionOf) -> list[Outcome]:
+    def _step_once(self, actions: Mapping[str, Any]) -> list[Outcome]:
         before = tuple(self._environment.agents)
         chosen = {
-            agent: action_of(agent) if agent in self._agents else self._others(agent, *self._seen[agent])
+            agent: actions[agent] if agent in self._agents else self._others(agent, *self._seen[agent])
             for agent in before
         }
         observations, rewards, terminated, truncated, infos = self._environment.step(chosen)

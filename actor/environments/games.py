@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector.utils import create_empty_array
 
+from daedalus.actor.environments.bots import Bot, LegalActions
 from daedalus.actor.environments.components import dtype_misfit, leaves, without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
@@ -26,11 +27,13 @@ from daedalus.actor.environments.environment_errors import (
 )
 from daedalus.actor.environments.game_copies import Outcome, game_copy
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
+from daedalus.actor.environments.rendering import render_without_display
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
+_SHOWN = ("ansi", "rgb_array")  # render modes, the best first
 _AGENT = "agent"  # component of the observation with environment.agent_ids
 _MOST_NAMES = 6  # of agents in a message
 
@@ -47,7 +50,7 @@ class GameEnvironments:
           name: id of the game, for errors.
           copies: the environments, of one kind.
           spec: which components are left out, and whether the observation names the agent.
-          seats: the agents that the policy plays. The others take random legal actions.
+          seats: the agents that have seats. The others take random legal actions.
 
         Raises EnvironmentSetupError.
         """
@@ -55,8 +58,15 @@ class GameEnvironments:
         self.seats = len(seats)
         self.count = len(copies) * len(seats)
         self._numbers = {agent: number for number, agent in enumerate(seats)}
-        self._others = np.random.default_rng(0)
-        self._games = [game_copy(environment, spec, seats, self._random_action) for environment in copies]
+        self._random = [np.random.default_rng(number) for number in range(len(copies))]
+        self._others: dict[str, LegalActions] = {}  # of the agents without a seat
+        self._games = [
+            game_copy(environment, spec, seats, partial(self._random_action, number))
+            for number, environment in enumerate(copies)
+        ]
+        self._bots: list[Bot | None] = [None] * self.count  # of the seats, from the next match on
+        self._in_match: list[Bot | None] = [None] * self.count
+        self._newest: list[tuple[Any, Any]] = [(None, None)] * self.count  # observation and mask of each bot's seat
         self._agent_ids = spec.agent_ids
         self._of_game: gymnasium.Space = copies[0].observation_space(seats[0])
         self.observation_space = _with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
@@ -80,14 +90,29 @@ class GameEnvironments:
         """Whether the match of each copy has ended, [copies] bool."""
         return np.array([game.is_over for game in self._games])
 
+    def seat_bot(self, seat: int, bot: Bot | None) -> None:
+        """Let a bot choose the actions of a seat from the next match of its copy on; None: the caller chooses them.
+
+        A bot's seat is `acting` as others are, and what the caller chooses for it has no effect. A bot plays one seat.
+        """
+        self._bots[seat] = bot
+
     def reset(self, seed: int) -> Any:
         """See BackendEnvironments."""
-        self._others = np.random.default_rng(seed)
         self.acting = np.zeros(self.count, np.bool_)
         self._ended[:] = self._acts[:] = False
         for number in range(len(self._games)):
+            self._random[number] = np.random.default_rng(seed + number)
+            self._begin_match(number)
             self._note(number, self._call("reset", number, seed + number))
         return self.observations
+
+    def _begin_match(self, number: int) -> None:
+        for agent, place in self._numbers.items():
+            seat = number * self.seats + place
+            bot = self._in_match[seat] = self._bots[seat]
+            if bot is not None:
+                bot.reset(agent, int(self._random[number].integers(2**31)))
 
     def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments. The actions of seats that were not acting have no effect."""
@@ -97,19 +122,24 @@ class GameEnvironments:
         self._acts |= acted & ~self._ended
         for number, game in enumerate(self._games):
             if game.is_over:
+                self._begin_match(number)
                 outcomes = self._call("reset", number, None)
                 if not outcomes:
                     raise EnvironmentSetupError(f"environment {self.name}: no agent can act after reset")
             else:
-                outcomes = self._call("step", number, partial(self._action_of, actions, number))
+                first = number * self.seats
+                chosen = {agent: self._chosen(actions, first + self._numbers[agent]) for agent in game.turns}
+                outcomes = self._call("step", number, chosen)
             for outcome in self._note(number, outcomes):
                 seat = number * self.seats + self._numbers[outcome.agent]
                 rewards[seat] = outcome.reward
                 terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
         return self.observations, rewards, terminated, truncated
 
-    def _action_of(self, actions: Any, number: int, agent: str) -> Any:
-        return _only(self.action_space, actions, number * self.seats + self._numbers[agent])
+    def _chosen(self, actions: Any, seat: int) -> Any:
+        """Return the action of a seat that must act: its bot's, or the caller's."""
+        bot = self._in_match[seat]
+        return _only(self.action_space, actions, seat) if bot is None else bot.act(*self._newest[seat])
 
     def _call(self, call: str, number: int, argument: Any) -> list[Outcome]:
         try:
@@ -128,6 +158,8 @@ class GameEnvironments:
             seat = number * self.seats + self._numbers[outcome.agent]
             self._write(seat, outcome)
             self.acting[seat] = True
+            if self._in_match[seat] is not None:
+                self._newest[seat] = outcome.observation, _mask(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:
                 self._warn_of_reward(outcome)
                 outcome = outcome._replace(reward=0.0)
@@ -196,16 +228,25 @@ class GameEnvironments:
                 outcome.reward,
             )
 
-    def _random_action(self, agent: str, observation: Any, info: Any) -> Any:
-        """Return a legal action of an agent that the policy does not play."""
-        space = self._environments[0].action_space(agent)
-        mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
-        if mask is None and isinstance(info, Mapping):
-            mask = info.get(MASK_KEY)
-        if mask is not None and isinstance(space, gymnasium.spaces.Discrete):
-            return int(space.start) + int(self._others.choice(np.flatnonzero(mask)))
-        space.seed(int(self._others.integers(2**31)))
-        return space.sample()
+    def _random_action(self, number: int, agent: str, observation: Any, info: Any) -> Any:
+        """Return a legal action of an agent without a seat."""
+        if agent not in self._others:
+            self._others[agent] = LegalActions(self._environments[0].action_space(agent))
+        return self._others[agent].sample(_mask(observation, info), self._random[number])
+
+    def render(self) -> str | np.ndarray | None:
+        """Return the first copy as a text or an image [H, W, 3] uint8; None if the games were not made to be shown."""
+        environment = self._environments[0]
+        if getattr(environment, "render_mode", None) not in _SHOWN:
+            return None
+        try:
+            with USER_STATE:
+                shown = environment.render()
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise playing_error(self.name, "render", error) from error
+        if isinstance(shown, str) or (isinstance(shown, np.ndarray) and shown.ndim == 3):
+            return shown
+        return None
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""
@@ -224,13 +265,22 @@ class GameEnvironments:
             raise EnvironmentSetupError(f"environment {self.name}: close raises {first_line(errors[0])}") from errors[0]
 
 
-def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameEnvironments:
-    """Return `count` copies of the game that a specification names. Raises EnvironmentSetupError."""
+def _mask(observation: Any, info: Any) -> Any:
+    """Return the mask of legal actions that a game gives with an observation, or None."""
+    mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
+    return info.get(MASK_KEY) if mask is None and isinstance(info, Mapping) else mask
+
+
+def make_games(spec: EnvironmentSpec, count: int, modules: UserModules, *, shown: bool = False) -> GameEnvironments:
+    """Return `count` copies of the game that a specification names. Raises EnvironmentSetupError.
+
+    `shown`: they render texts or images, if they can.
+    """
     copies: list[Any] = []
     try:
         for made in range(count):
             with creation_errors(spec.id, hint_of_count(made, count)):
-                copies.append(_make(spec, modules))
+                copies.append(_make_shown(spec, modules) if shown else _make(spec, modules))
         return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
     except BaseException:
         for each in copies:
@@ -238,7 +288,24 @@ def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameE
         raise
 
 
-def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
+def _make_shown(spec: EnvironmentSpec, modules: UserModules) -> Any:
+    """Return a game that renders itself as a text or an image if it can: it says so in its metadata."""
+    render_without_display()
+    environment = _make(spec, modules)
+    modes = getattr(environment, "metadata", {}).get("render_modes", ())
+    mode = next((mode for mode in _SHOWN if mode in modes), None)
+    if mode is None or "render_mode" in spec.constructor_kwargs:
+        return environment
+    try:
+        rendered = _make(spec, modules, render_mode=mode)
+    except (Exception, SystemExit) as error:  # of the user's code: its function need not have this argument
+        _logger.warning("environment %s cannot be made with render_mode=%r: %s", spec.id, mode, first_line(error))
+        return environment
+    environment.close()
+    return rendered
+
+
+def _make(spec: EnvironmentSpec, modules: UserModules, **options: Any) -> Any:
     module_name, colon, function = spec.id.partition(":")
     if colon:
         try:
@@ -251,7 +318,7 @@ def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
         function = "env"
     if not callable(make):
         raise EnvironmentSetupError(f"environment {spec.id}: there is no function {function}() that makes the game")
-    environment = make(**spec.constructor_kwargs)
+    environment = make(**{**spec.constructor_kwargs, **options})
     if not hasattr(environment, "possible_agents"):
         raise EnvironmentSetupError(
             f"environment {spec.id} made {type(environment).__name__}, which has no possible_agents: "
