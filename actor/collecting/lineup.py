@@ -270,16 +270,10 @@ class Lineup:
             noise = Noise(*(np.where(greedy[:, None], *pair) for pair in zip(neutral, noise, strict=True)))
         return noise
 
-    def step(self, acted: np.ndarray, rewards: np.ndarray, ended: Sequence[int]) -> None:
-        """Count what a step brought.
-
-        Args:
-          acted: [seats] bool, whether the reward belongs to an action of this match.
-          rewards: [seats].
-          ended: copies whose match ended with this step.
-        """
+    def step(self, rewards: np.ndarray, ended: Sequence[int]) -> None:
+        """Count what a step brought: the rewards of all seats, and the copies whose match ended with it."""
         if self.has_opponents:
-            self._scores += np.where(acted, rewards, 0.0)
+            self._scores += rewards
         for copy in ended:
             self._count(copy)
             rates = copy >= self._learned

@@ -141,7 +141,8 @@ class GameEnvironments:
                 first = number * self.seats
                 chosen = {agent: self._chosen(actions, first + self._numbers[agent]) for agent in game.turns}
                 outcomes = self._call("step", number, chosen)
-            for outcome in self._note(number, outcomes):
+            self._note(number, outcomes)
+            for outcome in outcomes:
                 seat = number * self.seats + self._numbers[outcome.agent]
                 rewards[seat] = outcome.reward
                 terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
@@ -163,9 +164,8 @@ class GameEnvironments:
             raise playing_error(self.name, call, error) from error
         return outcomes
 
-    def _note(self, number: int, outcomes: list[Outcome]) -> list[Outcome]:
-        """Write what is new for the seats of a copy, and return it; a reward without an action is left out."""
-        noted = []
+    def _note(self, number: int, outcomes: list[Outcome]) -> None:
+        """Write what is new for the seats of a copy."""
         for outcome in outcomes:
             seat = number * self.seats + self._numbers[outcome.agent]
             self._write(seat, outcome)
@@ -174,15 +174,12 @@ class GameEnvironments:
                 self._newest[seat] = outcome.observation, _mask(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:
                 self._warn_of_reward(outcome)
-                outcome = outcome._replace(reward=0.0)
             self._ended[seat] = outcome.terminated or outcome.truncated
             if self._ended[seat]:
                 self._acts[seat] = False
                 if outcome.info:
                     kept = info_to_keep(dict(outcome.info), ended=True)
                     self._episode_info.add({name: np.array([kept[name]]) for name in kept}, np.array([True]))
-            noted.append(outcome)
-        return noted
 
     def _write(self, seat: int, outcome: Outcome) -> None:
         observation = outcome.observation
@@ -234,7 +231,8 @@ class GameEnvironments:
         if not self._warned:
             self._warned = True
             _logger.warning(
-                "environment %s: %s has the reward %g before its first action of a match: such rewards are ignored",
+                "environment %s: %s has the reward %g before its first action of a match: such rewards count in "
+                "results of matches, and are not learned from",
                 self.name,
                 outcome.agent,
                 outcome.reward,
