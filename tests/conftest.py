@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,6 +14,11 @@ from processes import Running, free_address, starting
 # The tensors of the tests are small. Further threads would spend most of their time waiting, on the cores of the other
 # processes of the tests. A learner sets its own number of threads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Keep bytecode, also where the environment asks for none, as container images do: the tests start hundreds of
+# processes, and each would spend a sixth of its time on compiling the same modules.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
 settings.register_profile("daedalus", deadline=None)
