@@ -56,7 +56,7 @@ SLOW_END = f"""{SEEN}
 # Between two calls of native code the interpreter calls no handlers, and a signal that comes during the first does not
 # interrupt the wait.
 NATIVE_THEN_WAIT = f"""{SEEN}
-    busy = functools.partial(hashlib.pbkdf2_hmac, "sha256", b"", b"", 3_000_000)
+    busy = functools.partial(hashlib.pbkdf2_hmac, "sha256", b"", b"", 1_000_000)
     list(map(operator.call, (busy, stop.wait)))
     seen.acquire()
     os._exit(8)

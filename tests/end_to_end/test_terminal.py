@@ -125,11 +125,16 @@ def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
     assert not processes_mentioning("shown-run")
 
 
-def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Callable[..., AtTerminal]) -> None:
+def test_on_a_dumb_terminal_the_lines_are_plain_and_the_page_stays_after_the_end_of_the_run_until_ctrl_c(
+    at_terminal: Callable[..., AtTerminal],
+) -> None:
     short = ("--env-steps", "20000", "--set", "evaluation.final_episodes=3", "--actors", "1")
-    running = at_terminal("train", "cartpole", "--watch", "--run-dir", "kept-run", *short)
+    running = at_terminal("train", "cartpole", "--watch", "--run-dir", "kept-run", *short, TERM="dumb")
     until(lambda: running.fault or "press Ctrl-C to close it" in running.text.replace("\n", ""))
     assert "report: kept-run/report.html" in running.text
+    assert re.search(rb"return .*updates.*actors 1\r\n", running.raw), running.raw
+    assert b"\x1b[1A" not in running.raw
+    assert b"\x1b[?25" not in running.raw
     port = re.search(r"http://127\.0\.0\.1:(\d+)/", running.raw.decode())
     assert port is not None
     with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/", timeout=LIMIT) as answer:
@@ -137,12 +142,3 @@ def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Calla
     running.type(b"\x03")
     assert running.wait() == 3  # that of the run
     assert not processes_mentioning("kept-run")
-
-
-def test_train_on_a_dumb_terminal_prints_plain_lines(at_terminal: Callable[..., AtTerminal]) -> None:
-    running = at_terminal(*ENDLESS, "--run-dir", "plain-run", TERM="dumb")
-    until(lambda: b"updates" in running.raw and b"actors 2" in running.raw)
-    running.type(b"\x03")
-    assert running.wait() == 1
-    assert b"\x1b[1A" not in running.raw
-    assert b"\x1b[?25" not in running.raw
