@@ -23,8 +23,9 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
 from daedalus.gateway.learner_link import NewestPolicy
-from daedalus.gateway.watching import camera as camera_module
-from daedalus.gateway.watching.camera import CameraProcess, frame
+from daedalus.gateway.watching import playing_process
+from daedalus.gateway.watching.camera import CameraProcess
+from daedalus.gateway.watching.playing_process import PolicySource, frame
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.messages import Snapshot, Welcome
@@ -38,8 +39,8 @@ STATE = np.zeros((3, 0), np.float32)
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for the end of a process as long as a busy machine may take."""
-    monkeypatch.setattr(camera_module, "_END_SECONDS", LIMIT)
-    monkeypatch.setattr(camera_module, "_KILLED_SECONDS", LIMIT)
+    monkeypatch.setattr(playing_process, "_END_SECONDS", LIMIT)
+    monkeypatch.setattr(playing_process, "_KILLED_SECONDS", LIMIT)
 
 
 def weights() -> dict[str, np.ndarray]:
@@ -117,6 +118,23 @@ def test_an_episode_is_played_with_pictures() -> None:
     assert jpeg(moments[0].picture)[:3] == b"\xff\xd8\xff"
 
 
+def test_all_agents_of_a_game_are_played_and_their_actions_named() -> None:
+    game = SPEC.environment.model_copy(update={"id": "pettingzoo.classic.tictactoe_v3", "backend": "pettingzoo"})
+    spec = SPEC.model_copy(update={"environment": game})
+    with closing(EpisodeCamera(spec.for_actors(), NO_MODULES, lambda observations, state: float(len(state)))) as camera:
+        policy = Policy.of(spec.policy, camera.spaces)
+        acting = OnnxRuntime(policy.model)
+        acting.load({name: value.detach().numpy() for name, value in policy.network.named_parameters()})
+        moments = list(camera.play(acting))
+    names = [[fact["name"] for fact in moment.actions] for moment in moments]
+    assert names == [[f"player_{1 + number % 2} action"] for number in range(len(moments))]
+    taken = [choice for moment in moments for choice, _, was_taken in moment.actions[0]["choices"] if was_taken]
+    assert len(set(taken)) == len(moments) >= 5  # no field twice
+    assert all(sum(share for _, share, _ in moment.actions[0]["choices"]) > 0.9 for moment in moments)
+    assert {moment.value for moment in moments} == {1.0}
+    assert (moments[0].picture != moments[-1].picture).any()
+
+
 @pytest.mark.skipif(find_library("EGL") is None, reason="libEGL is not installed")
 def test_mujoco_is_rendered_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco")
@@ -150,9 +168,8 @@ def facts_of(frame: bytes) -> dict[str, Any]:
 
 def test_the_process_runs_while_somebody_watches_only() -> None:
     async def watch() -> None:
-        camera = CameraProcess(COMMAND)
         newest: list[NewestPolicy | None] = [None]
-        camera.newest_policy = lambda: newest[0]
+        camera = CameraProcess(COMMAND, PolicySource(lambda: newest[0]))
         frames = camera.frames()
         async with asyncio.timeout(LIMIT):
             assert "no policy yet" in facts_of(await anext(frames))["error"]
@@ -199,8 +216,7 @@ def test_the_page_is_told_why_there_is_no_picture() -> None:
     newest = policy(spec)
 
     async def watch() -> str:
-        camera = CameraProcess(COMMAND)
-        camera.newest_policy = lambda: newest
+        camera = CameraProcess(COMMAND, PolicySource(lambda: newest))
         frames = camera.frames()
         async with asyncio.timeout(LIMIT):
             facts = facts_of(await anext(frames))
@@ -218,8 +234,7 @@ ONE = "import struct, sys\nsys.stdout.buffer.write(struct.pack('<I', 4) + bytes(
 async def watched_for_a_frame(program: str) -> CameraProcess:
     """Return the camera of a Python program that somebody watched until its first frame."""
     newest = policy()
-    camera = CameraProcess((sys.executable, "-c", program))
-    camera.newest_policy = lambda: newest
+    camera = CameraProcess((sys.executable, "-c", program), PolicySource(lambda: newest))
     frames = camera.frames()
     async with asyncio.timeout(LIMIT):
         await anext(frames)
