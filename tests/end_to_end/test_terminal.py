@@ -125,16 +125,11 @@ def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
     assert not processes_mentioning("shown-run")
 
 
-def test_on_a_dumb_terminal_the_lines_are_plain_and_the_page_stays_after_the_end_of_the_run_until_ctrl_c(
-    at_terminal: Callable[..., AtTerminal],
-) -> None:
+def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Callable[..., AtTerminal]) -> None:
     short = ("--env-steps", "20000", "--set", "evaluation.final_episodes=3", "--actors", "1")
-    running = at_terminal("train", "cartpole", "--watch", "--run-dir", "kept-run", *short, TERM="dumb")
+    running = at_terminal("train", "cartpole", "--watch", "--run-dir", "kept-run", *short)
     until(lambda: running.fault or "press Ctrl-C to close it" in running.text.replace("\n", ""))
     assert "report: kept-run/report.html" in running.text
-    assert re.search(rb"return .*updates.*actors 1\r\n", running.raw), running.raw
-    assert b"\x1b[1A" not in running.raw
-    assert b"\x1b[?25" not in running.raw
     port = re.search(r"http://127\.0\.0\.1:(\d+)/", running.raw.decode())
     assert port is not None
     with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/", timeout=LIMIT) as answer:
