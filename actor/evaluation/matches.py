@@ -46,7 +46,7 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
     share, square = count / total, _Z**2
     centre = (share + square / (2 * total)) / (1 + square / total)
     half = _Z / (1 + square / total) * math.sqrt(share * (1 - share) / total + square / (4 * total**2))
-    return max(centre - half, 0.0), min(centre + half, 1.0)
+    return (centre - half if count else 0.0), (centre + half if count < total else 1.0)
 
 
 def play_matches(
