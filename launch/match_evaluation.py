@@ -29,7 +29,7 @@ _FEW = 0.5  # share of the games that must differ from all others, unless a note
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Score:
+class MatchScore:
     """How the games of a policy against an opponent ended. Intervals are Wilson's, at 95 %."""
 
     agents: tuple[str, ...]  # of the policy's side; empty for all sides together
@@ -53,8 +53,8 @@ class MatchScores:
     opponent_version: int | None
     openings: int  # random env_steps at the start of each game
     distinct_games: int  # games that differ in what their agents observed
-    sides: tuple[Score, ...]
-    total: Score
+    sides: tuple[MatchScore, ...]
+    total: MatchScore
 
 
 def evaluated_matches(
@@ -175,11 +175,11 @@ def _runtime(policy: SavedPolicy, stop: threading.Event) -> OnnxRuntime:
     return runtime
 
 
-def _score(results: MatchResults, chosen: np.ndarray, agents: tuple[str, ...]) -> Score:
+def _score(results: MatchResults, chosen: np.ndarray, agents: tuple[str, ...]) -> MatchScore:
     games = int(chosen.sum())
     wins, draws, losses = (int((results.outcomes[chosen] == outcome).sum()) for outcome in range(3))
     own, opponents = results.returns[chosen].mean(axis=0).tolist()
-    return Score(
+    return MatchScore(
         agents=agents,
         games=games,
         wins=wins,
