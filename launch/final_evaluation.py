@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from daedalus.actor.evaluation.episodes import EvaluationStoppedError
-from daedalus.launch.evaluation import evaluated_environment
+from daedalus.launch.evaluation_options import evaluated_environment
 from daedalus.launch.logs import configure_logging, print_error
 from daedalus.launch.process_lifecycle import (
     FAILED,
