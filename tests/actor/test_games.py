@@ -11,6 +11,10 @@ from gymnasium.spaces import Box, Discrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
+from pettingzoo.butterfly.knights_archers_zombies import knights_archers_zombies
+from pettingzoo.classic.tictactoe import tictactoe
+from pettingzoo.utils.conversions import aec_to_parallel_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from plain import PlainPolicy
 
 from daedalus.actor.checking.check_report import EnvironmentReport
@@ -99,6 +103,47 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
             assert set(results) <= episodes
     finally:
         collector.close()
+
+
+class KeptChecks(OrderEnforcingWrapper):
+    """A wrapper that the backend does not know, with those of PettingZoo in it."""
+
+
+class KeptConversion(aec_to_parallel_wrapper):
+    """A conversion that the backend does not know."""
+
+
+def tic_tac_toe(*, kept: bool) -> Any:
+    return KeptChecks(tictactoe.env()) if kept else tictactoe.env()
+
+
+def zombies(*, kept: bool) -> Any:
+    game = knights_archers_zombies.env(spawn_delay=5, max_cycles=60)  # agents die early
+    return KeptConversion(game) if kept else aec_to_parallel_wrapper(game)
+
+
+@pytest.mark.parametrize("fields", [{}, {"leave_out": ("action_mask",)}, {"id": "test_games:zombies"}])
+def test_games_are_the_same_without_pettingzoo_s_checks(fields: dict[str, Any]) -> None:
+    tapes = []
+    for kept in (False, True):
+        spec = EnvironmentSpec(
+            **{"id": "test_games:tic_tac_toe", "backend": "pettingzoo", "kwargs": {"kept": kept}, **fields}
+        )
+        environments = make_environments(spec, 2, modules=UserModules(frozenset({"test_games"})))
+        random = np.random.default_rng(4)
+        observed, tape = environments.reset(2), []
+        for _ in range(80):
+            legal = observed.masks.get("action", np.ones((environments.count, 6)))
+            if "leave_out" in fields:
+                legal = np.ones((environments.count, 9))  # the wrapper ends the match at an illegal action
+            actions = np.argmax(legal * random.random(legal.shape), axis=1)[:, None]
+            observed, *outcome = environments.step({"action": actions})
+            tape.append((*(values.copy() for values in observed.frames.values()), observed.acting, *outcome))
+        environments.close()
+        tapes.append(tape)
+    for one, other in zip(*tapes, strict=True):
+        for values, same in zip(one, other, strict=True):
+            np.testing.assert_array_equal(values, same)
 
 
 def make(problem: str = "", **fields: Any) -> EnvironmentReport:
