@@ -7,7 +7,7 @@ leave early or appear late are then one case: each step says which seats have so
 import importlib
 import logging
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -79,6 +79,7 @@ class GameEnvironments:
         self._ended = np.zeros(self.count, np.bool_)
         self._acts = np.zeros(self.count, np.bool_)  # whether the seat has acted in this match
         self._warned = False
+        self.resting = np.zeros(len(copies), np.bool_)  # copies that do not begin another match
         self._episode_info = EpisodeInfo()
         self.acting = np.zeros(self.count, np.bool_)
         self.action_mask: Any = None
@@ -89,6 +90,10 @@ class GameEnvironments:
     def over(self) -> np.ndarray:
         """Whether the match of each copy has ended, [copies] bool."""
         return np.array([game.is_over for game in self._games])
+
+    def is_over(self, copy: int) -> bool:
+        """Return whether the match of a copy has ended."""
+        return self._games[copy].is_over
 
     def seat_bot(self, seat: int, bot: Bot | None) -> None:
         """Let a bot choose the actions of a seat from the next match of its copy on; None: the caller chooses them.
@@ -122,6 +127,8 @@ class GameEnvironments:
         self._acts |= acted & ~self._ended
         for number, game in enumerate(self._games):
             if game.is_over:
+                if self.resting[number]:
+                    continue
                 self._begin_match(number)
                 outcomes = self._call("reset", number, None)
                 if not outcomes:
@@ -271,16 +278,26 @@ def _mask(observation: Any, info: Any) -> Any:
     return info.get(MASK_KEY) if mask is None and isinstance(info, Mapping) else mask
 
 
-def make_games(spec: EnvironmentSpec, count: int, modules: UserModules, *, shown: bool = False) -> GameEnvironments:
-    """Return `count` copies of the game that a specification names. Raises EnvironmentSetupError.
+def make_games(
+    spec: EnvironmentSpec,
+    count: int,
+    modules: UserModules,
+    further: Callable[[tuple[str, ...]], int] = lambda _: 0,
+    *,
+    shown: bool = False,
+) -> GameEnvironments:
+    """Return `count` copies of the game that a specification names, and further ones, as its seats demand.
 
-    `shown`: they render texts or images, if they can.
+    `shown`: they render texts or images, if they can. Raises EnvironmentSetupError, and what `further` raises.
     """
     copies: list[Any] = []
     try:
-        for made in range(count):
-            with creation_errors(spec.id, hint_of_count(made, count)):
+        while len(copies) < count:
+            with creation_errors(spec.id, hint_of_count(len(copies), count)):
                 copies.append(_make_shown(spec, modules) if shown else _make(spec, modules))
+            if len(copies) == 1:
+                seats = _seats(copies[0], spec)
+                count += further(seats)
         return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
     except BaseException:
         for each in copies:
