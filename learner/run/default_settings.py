@@ -37,6 +37,9 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = (), seats
         settings["training"].pop("entropy_bonus_final", None)
     if kind == "vectors_continuous" and spaces is not None:
         settings["policy"]["initial_std"] = round(settings["policy"]["initial_std"] * _noise_scale(spaces), 2)
+    for section, values in settings.pop("for_two_seats", {}).items():
+        if seats == _FULL_SEATS:
+            settings[section] |= values
     if seats > _FULL_SEATS:
         for collection in (settings["collection"], settings["with_memory"]["collection"]):
             collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)
