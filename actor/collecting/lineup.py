@@ -104,6 +104,7 @@ class Lineup:
         self._policies: dict[str, _OpponentPolicy] = {}  # the one that was chosen longest ago first
         self._counts: dict[Match, list[int]] = {}
         self._played, self._rated = 0, 0  # matches
+        self._opponent, self._left = NEWEST, 0  # of the next matches, and how many of them
         fixed = {name: weight for name, weight in league.opponents.items() if weight and is_bot(name)}
         self.plan = Plan(training=tuple(PlannedOpponent(player=name, weight=each) for name, each in fixed.items()))
         self.wanted = ""  # a player whose policy was to play and is not here; empty if there is none
@@ -122,6 +123,7 @@ class Lineup:
         self._policies.clear()
         self._counts.clear()
         self._scores[:] = 0.0
+        self._left = 0
         for copy in range(self._copies):
             self._choose(copy)
 
@@ -171,9 +173,12 @@ class Lineup:
             return None
         side = int(self._random.integers(len(self._sides)))
         if copy < self._learned:
-            plan = {(NEWEST, each.player): each.weight for each in self.plan.training}
-            drawn = self._pick(plan) or (NEWEST, NEWEST)
-            return Match("training", *drawn, side)
+            # As many matches in a row as copies play at once: one call then acts for all of them.
+            if self._left == 0 or not self._is_here(self._opponent):
+                drawn = self._pick({(NEWEST, each.player): each.weight for each in self.plan.training})
+                self._opponent, self._left = NEWEST if drawn is None else drawn[1], self._learned - self._alone
+            self._left -= 1
+            return Match("training", NEWEST, self._opponent, side)
         drawn = self._pick({(each.first, each.second): each.weight for each in self.plan.rating})
         return None if drawn is None else Match("rating", *drawn, side)
 
@@ -183,10 +188,10 @@ class Lineup:
         Return None if there is none. The policy that is missing is wanted.
         """
         for pairs in (weights, {pair: weight for pair, weight in weights.items() if all(map(self._is_here, pair))}):
-            total = sum(pairs.values())
-            if total <= 0.0:
+            below = np.cumsum(list(pairs.values()))
+            if not pairs or below[-1] <= 0.0:
                 return None
-            chosen = list(pairs)[int(self._random.choice(len(pairs), p=np.array(list(pairs.values())) / total))]
+            chosen = list(pairs)[int(np.searchsorted(below, self._random.random() * below[-1], side="right"))]
             missing = [name for name in chosen if not self._is_here(name)]
             if not missing:
                 for name in chosen:
