@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 import pyspiel  # pyright: ignore[reportMissingImports]
-from daedalus.learner.league.versions import VersionFolder
 from open_spiel.python.algorithms.exploitability import exploitability  # pyright: ignore[reportMissingImports]
 from open_spiel.python.policy import TabularPolicy  # pyright: ignore[reportMissingImports]
 
 from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import machine, table, train_in
 from daedalus.analysis.comparison import estimate, written
+from daedalus.learner.league.versions import VersionFolder
 from daedalus.policy.acting.value_estimator import ValueEstimator
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.policy.user_modules import NO_MODULES

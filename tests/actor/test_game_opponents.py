@@ -1,22 +1,21 @@
 """benchmarks/game_opponents.py: the solved tic-tac-toe, and the search of Connect Four against a plain one."""
 
+import importlib
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from benchmarks.game_opponents import (
-    ConnectFourDepth1,
-    ConnectFourDepth2,
-    ConnectFourDepth4,
-    connect_four_board,
-    has_four,
-)
 from daedalus.actor.environments.bots import make_bot
 from daedalus.actor.environments.games import make_games
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
+sys.path.append(str(Path(__file__).parents[2]))  # where benchmarks/ is
+opponents = importlib.import_module("benchmarks.game_opponents")
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
-PLAYERS = {1: ConnectFourDepth1, 2: ConnectFourDepth2, 4: ConnectFourDepth4}
+PLAYERS = {1: opponents.ConnectFourDepth1, 2: opponents.ConnectFourDepth2, 4: opponents.ConnectFourDepth4}
 
 
 def winner(board: np.ndarray) -> int:
@@ -91,8 +90,8 @@ def test_each_depth_sees_as_far_as_its_name_says() -> None:
 
 @pytest.mark.parametrize(("stones", "is_four"), [((0, 1, 2, 3), True), ((3, 4, 5, 7), False), ((5, 6, 7, 8), True)])
 def test_lines_end_at_the_border(stones: tuple[int, ...], is_four: bool) -> None:
-    assert has_four(sum(1 << cell for cell in stones)) is is_four
-    own, other = connect_four_board(np.ones((6, 7, 2), np.int8))
+    assert opponents.has_four(sum(1 << cell for cell in stones)) is is_four
+    own, other = opponents.connect_four_board(np.ones((6, 7, 2), np.int8))
     assert own == other == sum(1 << column * 7 + row for column in range(7) for row in range(6))
 
 
