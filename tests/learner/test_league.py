@@ -1,6 +1,7 @@
 """learner/league/: kept versions on the disk, plans and policies for actors, other runs as opponents, results."""
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -295,6 +296,15 @@ def test_an_actor_gets_plans_and_versions_and_the_ratings_are_in_the_status(tmp_
     saved = load_newest(training_run.directory).counters["league"]
     assert saved["players"][0]["player"] == NEWEST
     assert saved["players"][0]["matches"] > 0
+
+
+def test_a_game_with_opponents_needs_openskill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "openskill.models", None)
+    run = Run(tmp_path)
+    run.train(0)  # a game without opponents needs it not
+    assert isinstance(run.plan(), Refusal)
+    with pytest.raises(SettingsError, match=r'^ratings need openskill: pip install "daedalus-rl\[pettingzoo\]"$'):
+        run.train(0)
 
 
 def test_a_run_is_solved_by_a_win_rate(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def played(ratings: Ratings, first: str, second: str, *results: int) -> None:
 
 
 def of(ratings: Ratings, player: str) -> RatedPlayer:
-    return next(each for each in ratings.status(99, 99).players if each.player == player)
+    return next(each for each in ratings.status().players if each.player == player)
 
 
 def test_one_match_by_hand() -> None:
@@ -59,7 +59,7 @@ def test_a_version_has_the_rating_of_the_newest_policy_but_not_its_results() -> 
     ratings.keep(7)
     assert (of(ratings, "v7").rating, of(ratings, "v7").deviation) == (newest.rating, 100.0)
     assert of(ratings, "v7").matches == 0
-    assert [(each.first, each.second) for each in ratings.status(9, 9).scores] == [(NEWEST, "random")]
+    assert [(each.first, each.second) for each in ratings.status().scores] == [(NEWEST, "random")]
 
 
 def test_without_random_the_first_version_is_the_zero() -> None:
@@ -74,7 +74,7 @@ def test_old_results_of_the_newest_policy_count_less() -> None:
     ratings = Ratings(["a:B"])
     played(ratings, NEWEST, "a:B", 0, 0, 1000)
     played(ratings, "a:B", NEWEST, 0, 0, 400)
-    (score,) = ratings.status(9, 9).scores
+    (score,) = ratings.status().scores
     assert (score.first, score.second) == (NEWEST, "a:B")
     assert score.wins + score.losses == pytest.approx(200.0, abs=1.0)
     assert score.losses == pytest.approx(200.0 * (1 - 1 / 200) ** 400, rel=0.02)
@@ -230,15 +230,16 @@ def test_no_result_is_lost_and_plans_have_players_of_the_league_only(
     assert sum(each.weight for each in rating) == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_status_has_few_players_the_first_and_last_among_them() -> None:
-    ratings = Ratings(["random"])
+def test_a_status_of_a_very_large_league_has_a_part_of_the_players() -> None:
+    ratings = Ratings(["random", "a:B"])
     for version in range(200):
         ratings.keep(version)
         played(ratings, f"v{version}", NEWEST, 1, 0, 0)
-    status = ratings.status(20, 8)
-    assert len(status.players) == 20
-    assert len(status.scores) == 8
-    assert [status.players[index].player for index in (0, 1, -1)] == [NEWEST, "v0", "random"]
+        played(ratings, f"v{version}", "random", 3, 0, 0)
+    status = ratings.status()
+    assert 40 < len(status.players) < 100
+    assert [status.players[index].player for index in (0, 1, -3, -2, -1)] == [NEWEST, "v0", "v199", "a:B", "random"]
+    assert {name for each in status.scores for name in (each.first, each.second)} <= {p.player for p in status.players}
 
 
 @given(st.lists(st.integers(1, 50), min_size=1, max_size=80), st.integers(1, 12))
