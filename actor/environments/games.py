@@ -414,7 +414,11 @@ def _module(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is not None and name.startswith(error.name):
             raise EnvironmentSetupError(f"unknown game {name!r}: {first_line(error)}") from None
-        raise
+        group = name.split(".")[1]  # such as classic: PettingZoo has an extra of that name for what its games need
+        remedy = f'pip install "pettingzoo[{group}]"' if package == "pettingzoo" else "install it"
+        raise EnvironmentSetupError(
+            f"environment {name} needs a package that is not installed ({error.name}): {remedy}"
+        ) from None
 
 
 def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:

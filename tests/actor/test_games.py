@@ -1,6 +1,7 @@
 """Games with several agents: the rows of each seat, what is refused, and a training of one policy in all seats."""
 
 import re
+import sys
 from typing import Any
 
 import numpy as np
@@ -344,6 +345,14 @@ def test_games_that_render_no_images_cannot_be_filmed(field: str, reason: str) -
     spec = as_on_gymnasium(EnvironmentSpec(id=game, backend="pettingzoo"))
     with pytest.raises(EnvironmentSetupError, match=f"cannot render rgb_array images: {reason}"):
         make_environments(spec, 1, render_mode="rgb_array", modules=UserModules(frozenset({"test_games"})))
+
+
+def test_a_package_that_a_game_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "pettingzoo.classic.rps_v2", raising=False)
+    monkeypatch.setitem(sys.modules, "pettingzoo.classic.rps.rps", None)
+    game = EnvironmentSpec(id="pettingzoo.classic.rps_v2")
+    (problem,) = check_environment(game, UserModules(), seconds=0.0, env_steps=0).problems
+    assert problem.endswith('(pettingzoo.classic.rps.rps): pip install "pettingzoo[classic]"')
 
 
 def test_one_agent_of_two_may_be_the_policys() -> None:
