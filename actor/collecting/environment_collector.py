@@ -45,9 +45,14 @@ class EnvironmentCollector:
         if self._requested != requested:
             self.close()
         if self._environments is None:
-            self._environments = make_environments(spec.environment, count, modules=self._modules)
+            self._environments = self._make(spec)
             self._requested = requested
         return self._environments.spaces, self._environments.count
+
+    def _make(self, spec: ActorSpec) -> VectorEnvironment:
+        """Return new environments for a run."""
+        count = self._count or spec.collection.envs_per_actor
+        return make_environments(spec.environment, count, modules=self._modules)
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Reset the environments."""

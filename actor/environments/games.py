@@ -24,13 +24,13 @@ from daedalus.actor.environments.environment_errors import (
     playing_error,
 )
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
+from daedalus.actor.environments.roles import DifferentSpacesError, listed, roles_of
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
 _AGENT = "agent"  # component of the observation with environment.agent_ids
-_MOST_NAMES = 6  # of agents in a message
 _MOST_IDLE_TURNS = 100_000  # of agents that the policy does not play, between two turns of its seats
 
 _logger = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ class Outcome(NamedTuple):
     info: Mapping[str, Any]
 
 
-class _Game(Protocol):
+class Game(Protocol):
     """One copy of a game, whichever of PettingZoo's two interfaces it has."""
 
     def reset(self, seed: int | None) -> list[Outcome]:
@@ -72,13 +72,13 @@ class _TurnGame:
         self._turn: str | None = None  # the agent of ours that must act
 
     def reset(self, seed: int | None) -> list[Outcome]:
-        """See _Game."""
+        """See Game."""
         self._environment.reset(seed=seed)
         self._turn = None
-        return self._advance()
+        return _some(self._advance())
 
     def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """See _Game."""
+        """See Game."""
         if self._turn is not None:
             action, self._turn = actions[self._turn], None
             self._environment.step(action)
@@ -86,7 +86,7 @@ class _TurnGame:
 
     @property
     def is_over(self) -> bool:
-        """See _Game."""
+        """See Game."""
         return not self._environment.agents
 
     def _advance(self) -> list[Outcome]:
@@ -109,6 +109,13 @@ class _TurnGame:
         raise _idle()
 
 
+def _some(outcomes: list[Outcome]) -> list[Outcome]:
+    """Return what is new after a reset. Raises EnvironmentSetupError if there is nothing."""
+    if not outcomes:
+        raise EnvironmentSetupError("no agent can act after reset")
+    return outcomes
+
+
 def _idle() -> EnvironmentSetupError:
     return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
 
@@ -121,13 +128,13 @@ class _SimultaneousGame:
         self._seen: dict[str, tuple[Any, Any]] = {}  # newest observation and info of the agents that are not ours
 
     def reset(self, seed: int | None) -> list[Outcome]:
-        """See _Game."""
+        """See Game."""
         observations, infos = self._environment.reset(seed=seed)
         outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
-        return outcomes or self.step({})
+        return _some(outcomes or self.step({}))
 
     def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """See _Game."""
+        """See Game."""
         for _ in range(_MOST_IDLE_TURNS):
             outcomes = self._step_once(actions)
             if outcomes or self.is_over:
@@ -146,7 +153,7 @@ class _SimultaneousGame:
 
     @property
     def is_over(self) -> bool:
-        """See _Game."""
+        """See Game."""
         return not self._environment.agents
 
     def _outcomes(
@@ -200,10 +207,7 @@ class GameEnvironments:
         self.count = len(copies) * len(seats)
         self._numbers = {agent: number for number, agent in enumerate(seats)}
         self._others = np.random.default_rng(0)
-        kinds = [_SimultaneousGame if _is_parallel(each) else _TurnGame for each in copies]
-        self._games: list[_Game] = [
-            kind(environment, seats, self._random_action) for kind, environment in zip(kinds, copies, strict=True)
-        ]
+        self._games = self.games_of(seats)
         self._agent_ids = spec.agent_ids
         self._of_game: gymnasium.Space = copies[0].observation_space(seats[0])
         self.observation_space = _with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
@@ -219,6 +223,13 @@ class GameEnvironments:
         self.action_mask: Any = None
         self._has_masks: bool | None = None  # in `info`; None before the first reset
         self.reset(0)
+
+    def games_of(self, agents: Sequence[str]) -> list[Game]:
+        """Return each copy as a game of these agents; the others take random legal actions."""
+        return [
+            (_SimultaneousGame if _is_parallel(each) else _TurnGame)(each, agents, self._random_action)
+            for each in self._environments
+        ]
 
     @property
     def over(self) -> np.ndarray:
@@ -243,8 +254,6 @@ class GameEnvironments:
         for number, game in enumerate(self._games):
             if game.is_over:
                 outcomes = self._call("reset", number, None)
-                if not outcomes:
-                    raise EnvironmentSetupError(f"environment {self.name}: no agent can act after reset")
             else:
                 first = number * self.seats
                 chosen = {
@@ -361,28 +370,44 @@ class GameEnvironments:
     def close(self) -> None:
         """Close all copies, then raise the first exception that one of them raised."""
         environments, self._environments = self._environments, []
-        errors: list[BaseException] = []
-        for environment in environments:
-            try:
-                environment.close()
-            except (Exception, SystemExit) as error:  # of the user's code
-                errors.append(error)
-        if errors:
-            raise EnvironmentSetupError(f"environment {self.name}: close raises {first_line(errors[0])}") from errors[0]
+        close_copies(self.name, environments)
+
+
+def close_copies(name: str, environments: Sequence[Any]) -> None:
+    """Close all copies of a game, then raise the first exception that one of them raised."""
+    errors: list[BaseException] = []
+    for environment in environments:
+        try:
+            environment.close()
+        except (Exception, SystemExit) as error:  # of the user's code
+            errors.append(error)
+    if errors:
+        raise EnvironmentSetupError(f"environment {name}: close raises {first_line(errors[0])}") from errors[0]
 
 
 def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameEnvironments:
     """Return `count` copies of the game that a specification names. Raises EnvironmentSetupError."""
-    copies: list[Any] = []
+    copies = make_copies(spec, count, modules)
     try:
-        for made in range(count):
-            with creation_errors(spec.id, hint_of_count(made, count)):
-                copies.append(_make(spec, modules))
         return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
     except BaseException:
         for each in copies:
             each.close()
         raise
+
+
+def make_copies(spec: EnvironmentSpec, count: int, modules: UserModules) -> list[Any]:
+    """Return `count` PettingZoo environments of one kind. Raises EnvironmentSetupError."""
+    copies: list[Any] = []
+    try:
+        for made in range(count):
+            with creation_errors(spec.id, hint_of_count(made, count)):
+                copies.append(_make(spec, modules))
+    except BaseException:
+        for each in copies:
+            each.close()
+        raise
+    return copies
 
 
 def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
@@ -434,7 +459,7 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
     unknown = [agent for agent in spec.agents if agent not in possible]
     if unknown:
         raise EnvironmentSetupError(
-            f"environment.agents names {unknown[0]!r}, but the agents of {spec.id} are {_listed(possible)}"
+            f"environment.agents names {unknown[0]!r}, but the agents of {spec.id} are {listed(possible)}"
         )
     chosen = tuple(agent for agent in possible if agent in spec.agents) or possible
     groups: dict[str, list[str]] = {}
@@ -442,18 +467,8 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
         spaces = f"{environment.observation_space(agent)} {environment.action_space(agent)}"
         groups.setdefault(spaces, []).append(agent)
     if len(groups) > 1:
-        parts = "; ".join(_listed(group) for group in groups.values())
-        first = next(iter(groups.values()))
-        raise EnvironmentSetupError(
-            f"the agents of {spec.id} have different spaces ({parts}), and one policy plays agents with the same ones: "
-            f'choose them, as in --set "environment.agents={first}"; the others then take random actions'
-        )
+        raise DifferentSpacesError(spec.id, roles_of(list(groups.values()), possible))
     return chosen
-
-
-def _listed(agents: Sequence[str]) -> str:
-    more = len(agents) - _MOST_NAMES
-    return ", ".join(agents[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _with_agent(space: gymnasium.Space, seats: int) -> gymnasium.spaces.Dict:

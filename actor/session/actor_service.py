@@ -106,8 +106,15 @@ class ActorService:
                 self._upload_maker = make_upload_maker(welcome.spec, action.spaces, self._config.modules)
         return None
 
+    def on_wait(self) -> None:
+        """Do what falls due while a rollout waits for somebody else. Raises what ends the rollout."""
+        self._act_in_rollout(self._session.is_due(time.monotonic()))
+
     def _on_row(self) -> None:
-        if self._session.begin_row(time.monotonic()):
+        self._act_in_rollout(self._session.begin_row(time.monotonic()))
+
+    def _act_in_rollout(self, is_due: bool) -> None:
+        if is_due:
             self._thread.call(self._session.act_in_rollout)
         else:
             self._thread.call_after_events(self._session.check_over)

@@ -389,6 +389,10 @@ class ActorSession(PolicySession):
         No event changes what this method reads: it is no step.
         """
         self._pace.begin_row(now)
+        return self.is_due(now)
+
+    def is_due(self, now: float) -> bool:
+        """Return whether `act_in_rollout` is due, while no row begins because the rollout waits for somebody else."""
         self._is_fetch_due = self._schedule.is_due(now)
         return self._is_fetch_due or self.leave_by is not None or now >= self.reports.next_at
 
