@@ -8,12 +8,14 @@ import importlib
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
 from gymnasium.vector.utils import create_empty_array
 
+from daedalus.actor.environments.bots import Bot, LegalActions
 from daedalus.actor.environments.components import dtype_misfit, leaves, without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
@@ -116,6 +118,12 @@ def _some(outcomes: list[Outcome]) -> list[Outcome]:
     return outcomes
 
 
+def _mask(observation: Any, info: Any) -> Any:
+    """Return the mask of legal actions that a game gives with an observation, or None."""
+    mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
+    return info.get(MASK_KEY) if mask is None and isinstance(info, Mapping) else mask
+
+
 def _idle() -> EnvironmentSetupError:
     return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
 
@@ -198,7 +206,7 @@ class GameEnvironments:
           name: id of the game, for errors.
           copies: the environments, of one kind.
           spec: which components are left out, and whether the observation names the agent.
-          seats: the agents that the policy plays. The others take random legal actions.
+          seats: the agents that have seats. The others take random legal actions.
 
         Raises EnvironmentSetupError.
         """
@@ -206,8 +214,12 @@ class GameEnvironments:
         self.seats = len(seats)
         self.count = len(copies) * len(seats)
         self._numbers = {agent: number for number, agent in enumerate(seats)}
-        self._others = np.random.default_rng(0)
+        self._random = [np.random.default_rng(number) for number in range(len(copies))]
+        self._others: dict[str, LegalActions] = {}  # of the agents without a seat
         self._games = self.games_of(seats)
+        self._bots: list[Bot | None] = [None] * self.count  # of the seats, from the next match on
+        self._in_match: list[Bot | None] = [None] * self.count
+        self._newest: list[tuple[Any, Any]] = [(None, None)] * self.count  # observation and mask of each bot's seat
         self._agent_ids = spec.agent_ids
         self._of_game: gymnasium.Space = copies[0].observation_space(seats[0])
         self.observation_space = _with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
@@ -227,8 +239,8 @@ class GameEnvironments:
     def games_of(self, agents: Sequence[str]) -> list[Game]:
         """Return each copy as a game of these agents; the others take random legal actions."""
         return [
-            (_SimultaneousGame if _is_parallel(each) else _TurnGame)(each, agents, self._random_action)
-            for each in self._environments
+            (_SimultaneousGame if _is_parallel(each) else _TurnGame)(each, agents, partial(self._random_action, number))
+            for number, each in enumerate(self._environments)
         ]
 
     @property
@@ -236,14 +248,29 @@ class GameEnvironments:
         """Whether the match of each copy has ended, [copies] bool."""
         return np.array([game.is_over for game in self._games])
 
+    def seat_bot(self, seat: int, bot: Bot | None) -> None:
+        """Let a bot choose the actions of a seat from the next match of its copy on; None: the caller chooses them.
+
+        A bot's seat is `acting` as others are, and what the caller chooses for it has no effect. A bot plays one seat.
+        """
+        self._bots[seat] = bot
+
     def reset(self, seed: int) -> Any:
         """See BackendEnvironments."""
-        self._others = np.random.default_rng(seed)
         self.acting = np.zeros(self.count, np.bool_)
         self._ended[:] = self._acts[:] = False
         for number in range(len(self._games)):
+            self._random[number] = np.random.default_rng(seed + number)
+            self._begin_match(number)
             self._note(number, self._call("reset", number, seed + number))
         return self.observations
+
+    def _begin_match(self, number: int) -> None:
+        for agent, place in self._numbers.items():
+            seat = number * self.seats + place
+            bot = self._in_match[seat] = self._bots[seat]
+            if bot is not None:
+                bot.reset(agent, int(self._random[number].integers(2**31)))
 
     def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments. The actions of seats that were not acting have no effect."""
@@ -253,18 +280,24 @@ class GameEnvironments:
         self._acts |= acted & ~self._ended
         for number, game in enumerate(self._games):
             if game.is_over:
+                self._begin_match(number)
                 outcomes = self._call("reset", number, None)
             else:
                 first = number * self.seats
-                chosen = {
-                    agent: _only(self.action_space, actions, first + seat) for agent, seat in self._numbers.items()
-                }
+                chosen = {agent: self._chosen(actions, first + seat, acted) for agent, seat in self._numbers.items()}
                 outcomes = self._call("step", number, chosen)
             for outcome in self._note(number, outcomes):
                 seat = number * self.seats + self._numbers[outcome.agent]
                 rewards[seat] = outcome.reward
                 terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
         return self.observations, rewards, terminated, truncated
+
+    def _chosen(self, actions: Any, seat: int, acted: np.ndarray) -> Any:
+        """Return the action of a seat: its bot's, or the caller's."""
+        bot = self._in_match[seat]
+        if bot is None:
+            return _only(self.action_space, actions, seat)
+        return bot.act(*self._newest[seat]) if acted[seat] and not self._ended[seat] else None
 
     def _call(self, call: str, number: int, argument: Any) -> list[Outcome]:
         try:
@@ -283,6 +316,8 @@ class GameEnvironments:
             seat = number * self.seats + self._numbers[outcome.agent]
             self._write(seat, outcome)
             self.acting[seat] = True
+            if self._in_match[seat] is not None:
+                self._newest[seat] = outcome.observation, _mask(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:
                 self._warn_of_reward(outcome)
                 outcome = outcome._replace(reward=0.0)
@@ -352,16 +387,11 @@ class GameEnvironments:
                 outcome.reward,
             )
 
-    def _random_action(self, agent: str, observation: Any, info: Any) -> Any:
-        """Return a legal action of an agent that the policy does not play."""
-        space = self._environments[0].action_space(agent)
-        mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
-        if mask is None and isinstance(info, Mapping):
-            mask = info.get(MASK_KEY)
-        if mask is not None and isinstance(space, gymnasium.spaces.Discrete):
-            return int(space.start) + int(self._others.choice(np.flatnonzero(mask)))
-        space.seed(int(self._others.integers(2**31)))
-        return space.sample()
+    def _random_action(self, number: int, agent: str, observation: Any, info: Any) -> Any:
+        """Return a legal action of an agent without a seat."""
+        if agent not in self._others:
+            self._others[agent] = LegalActions(self._environments[0].action_space(agent))
+        return self._others[agent].sample(_mask(observation, info), self._random[number])
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""
