@@ -18,6 +18,7 @@ class EnvironmentReport(Specification):
     spaces: Spaces | None = None  # as a run has them; None if the environment cannot be made or is not supported
     constant_texts: dict[str, str] = Field(default_factory=dict)  # components left out, and their content
     problems: tuple[str, ...] = ()  # training would fail
+    roles: dict[str, tuple[str, ...]] = Field(default_factory=dict)  # agents by role, if each needs its own policy
     warnings: tuple[str, ...] = ()  # training would run, perhaps not as intended
     notes: tuple[str, ...] = ()  # advice of gymnasium's own checker
     env_steps: int = 0  # played

@@ -16,7 +16,7 @@ class DifferentSpacesError(EnvironmentSetupError):
       roles: the agents of each role, by its name.
     """
 
-    def __init__(self, game: str, roles: Mapping[str, Sequence[str]]) -> None:
+    def __init__(self, game: str, roles: Mapping[str, tuple[str, ...]]) -> None:
         parts = "; ".join(listed(agents) for agents in roles.values())
         first = list(next(iter(roles.values())))
         super().__init__(
@@ -24,7 +24,7 @@ class DifferentSpacesError(EnvironmentSetupError):
             f"`daedalus train --env {game}` starts a learner for each role ({', '.join(roles)}), or choose one role, "
             f'as in --set "environment.agents={first}"; the others then take random actions'
         )
-        self.roles = roles
+        self.roles = dict(roles)
 
 
 def listed(agents: Sequence[str]) -> str:

@@ -18,7 +18,7 @@ from daedalus.actor.session.actor_service import ActorService
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.protocol import keys
-from daedalus.protocol.messages import Snapshot, Welcome
+from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -187,7 +187,6 @@ class RoleActor:
         seatings: Sequence[Seating],
         connect: Callable[[], Transport],
         stop: threading.Event,
-        on_join: Callable[[Welcome], object] = lambda _: None,
     ) -> None:
         """Construct the sessions, and connect each of them.
 
@@ -196,7 +195,6 @@ class RoleActor:
           seatings: the seats, of at least one run with a learner.
           connect: returns a connection of its own for each session; the caller closes it.
           stop: event that ends `run`.
-          on_join: see ActorService.
         """
         self._stop, self._ends = stop, threading.Event()
         self._games = SharedGames({each.run: each.names for each in seatings}, config.environments, config.modules)
@@ -206,7 +204,7 @@ class RoleActor:
             role = _Role(each, collector, self._check)
             if each.policy is None:
                 own = replace(config, name=keys.as_name(f"{config.name}.{'-'.join(each.names)}"), run=each.run)
-                role.service = ActorService(own, connect(), self._ends, collector, on_join)
+                role.service = ActorService(own, connect(), self._ends, collector)
                 collector.on_wait = role.service.on_wait
             self._roles.append(role)
 
