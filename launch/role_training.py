@@ -4,7 +4,6 @@ import logging
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NoReturn
 
 from daedalus.actor.environments.roles import seat_names
@@ -55,23 +54,6 @@ class RoleRun:
     def name(self) -> str:
         """The name of the run."""
         return run_directory.run_name(self.run.directory)
-
-
-def directories_of(parent: Path) -> dict[str, Path]:
-    """Return the run directories of a training of roles, by role. Empty if the directory is none."""
-    prefix = f"{parent.resolve().name}-"
-    if (parent / run_directory.CONFIG).exists():
-        return {}
-    return {
-        each.parent.name.removeprefix(prefix): each.parent
-        for each in sorted(parent.glob(f"*/{run_directory.CONFIG}"))
-        if each.parent.name.startswith(prefix)
-    }
-
-
-def directory_of(parent: Path, role: str) -> Path:
-    """Return the run directory of a role, whose name is unique beside other runs of the network."""
-    return parent / f"{parent.resolve().name}-{role}"
 
 
 def seats_of(specs: Mapping[str, RunSpec]) -> dict[str, tuple[str, ...]]:

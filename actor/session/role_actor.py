@@ -207,10 +207,10 @@ class RoleActor:
                 role.service = ActorService(own, connect(), self._ends, collector)
                 collector.on_wait = role.service.on_wait
             self._roles.append(role)
+        self._learning = [role for role in self._roles if role.service is not None]
 
     def run(self) -> bool:
         """Collect until `stop` or until all runs are over; return whether all finished. Raises as ActorService.run."""
-        learning = [role for role in self._roles if role.service is not None]
         try:
             for role in self._roles:
                 role.thread.start()
@@ -218,9 +218,9 @@ class RoleActor:
             while any(role.thread.is_alive() for role in self._roles):
                 stopped = self._stop.wait(_POLL_SECONDS)
                 failed = any(role.error is not None for role in self._roles)
-                if stopped or failed or all(role.finished or role.left for role in learning):
+                if stopped or failed:
                     self._ends.set()
-                elif not left and any(role.left for role in learning):
+                elif not left and any(role.left for role in self._roles):
                     left = True
                     self.leave(time.monotonic() + _LEAVE_SECONDS)
         finally:
@@ -232,14 +232,14 @@ class RoleActor:
         for role in self._roles:
             if role.error is not None:
                 raise role.error
-        return all(role.finished for role in learning)
+        return all(role.finished for role in self._learning)
 
     def leave(self, by: float) -> None:
         """Finish and upload the present rollouts, then end `run`; at the latest at a monotonic time."""
-        for role in self._roles:
+        for role in self._learning:
             if role.service is not None and not (role.finished or role.left):
                 role.service.leave(by)
 
     def _check(self) -> None:
-        if self._ends.is_set():
+        if self._ends.is_set() or all(role.finished or role.left for role in self._learning):
             raise _AllOverError

@@ -200,7 +200,7 @@ class ActorSession(PolicySession):
                 welcome = yield from self.find_learner()
                 yield from self._play_with(welcome)
             except LearnerLostError as error:
-                _logger.info("%s", error)
+                _logger.info("run %r: %s", self.run, error)
                 self._plays = self._is_collecting = False
 
     # ------------------------------------------------------------------------------- what ends a session, and waits
