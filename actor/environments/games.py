@@ -1,7 +1,7 @@
 """Backend `pettingzoo`: environments with several agents, each of which is a seat with rows of its own.
 
-A copy of the game is stepped until some of its seats must act. Agents that act together, in turns, leave early or
-appear late are then one case: each step says which seats have something new.
+A copy of the game is stepped until some of its seats must act (game_copies.py). Agents that act together, in turns,
+leave early or appear late are then one case: each step says which seats have something new.
 """
 
 import importlib
@@ -9,7 +9,7 @@ import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -25,175 +25,20 @@ from daedalus.actor.environments.environment_errors import (
     import_extra,
     playing_error,
 )
+from daedalus.actor.environments.game_copies import GameCopy, Outcome, game_copy, without_checks
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
+from daedalus.actor.environments.rendering import frame_rate, render_without_display
 from daedalus.actor.environments.roles import DifferentSpacesError, listed, roles_of
 from daedalus.actor.environments.vector_environments import BackendStep
+from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
+_SHOWN = ("ansi", "rgb_array")  # render modes, the best first
 _AGENT = "agent"  # component of the observation with environment.agent_ids
-_MOST_IDLE_TURNS = 100_000  # of agents that the policy does not play, between two turns of its seats
 
 _logger = logging.getLogger(__name__)
-
-
-class Outcome(NamedTuple):
-    """What is new for one agent: an observation to act on, or the last one of its episode."""
-
-    agent: str
-    observation: Any
-    reward: float  # since its last action
-    terminated: bool
-    truncated: bool
-    info: Mapping[str, Any]
-
-
-class Game(Protocol):
-    """One copy of a game, whichever of PettingZoo's two interfaces it has."""
-
-    def reset(self, seed: int | None) -> list[Outcome]:
-        """Begin a match, and return what is new for its first agents."""
-        ...
-
-    def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """Play on with the actions of the agents that must act, until an agent of ours has something new."""
-        ...
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the match has ended for all agents."""
-        ...
-
-
-class _TurnGame:
-    """A game whose agents act one after the other (PettingZoo's AEC interface)."""
-
-    def __init__(self, environment: Any, agents: Sequence[str], others: Callable[[str, Any, Any], Any]) -> None:
-        self._environment, self._agents, self._others = environment, frozenset(agents), others
-        self._turn: str | None = None  # the agent of ours that must act
-
-    def reset(self, seed: int | None) -> list[Outcome]:
-        """See Game."""
-        self._environment.reset(seed=seed)
-        self._turn = None
-        return _some(self._advance())
-
-    def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """See Game."""
-        if self._turn is not None:
-            action, self._turn = actions[self._turn], None
-            self._environment.step(action)
-        return self._advance()
-
-    @property
-    def is_over(self) -> bool:
-        """See Game."""
-        return not self._environment.agents
-
-    def _advance(self) -> list[Outcome]:
-        """Return what is new up to the next turn of an agent of ours, at most once for each agent."""
-        environment, outcomes = self._environment, dict[str, Outcome]()
-        for _ in range(_MOST_IDLE_TURNS):
-            if self.is_over:
-                return list(outcomes.values())
-            agent = environment.agent_selection
-            if agent in outcomes:  # the next call passes it on
-                return list(outcomes.values())
-            observation, reward, terminated, truncated, info = environment.last()
-            ended = bool(terminated or truncated)
-            if agent in self._agents:
-                outcomes[agent] = Outcome(agent, observation, float(reward), bool(terminated), bool(truncated), info)
-                if not ended:
-                    self._turn = agent
-                    return list(outcomes.values())
-            environment.step(None if ended else self._others(agent, observation, info))
-        raise _idle()
-
-
-def _some(outcomes: list[Outcome]) -> list[Outcome]:
-    """Return what is new after a reset. Raises EnvironmentSetupError if there is nothing."""
-    if not outcomes:
-        raise EnvironmentSetupError("no agent can act after reset")
-    return outcomes
-
-
-def _mask(observation: Any, info: Any) -> Any:
-    """Return the mask of legal actions that a game gives with an observation, or None."""
-    mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
-    return info.get(MASK_KEY) if mask is None and isinstance(info, Mapping) else mask
-
-
-def _idle() -> EnvironmentSetupError:
-    return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
-
-
-class _SimultaneousGame:
-    """A game whose agents act together (PettingZoo's parallel interface)."""
-
-    def __init__(self, environment: Any, agents: Sequence[str], others: Callable[[str, Any, Any], Any]) -> None:
-        self._environment, self._agents, self._others = environment, frozenset(agents), others
-        self._seen: dict[str, tuple[Any, Any]] = {}  # newest observation and info of the agents that are not ours
-
-    def reset(self, seed: int | None) -> list[Outcome]:
-        """See Game."""
-        observations, infos = self._environment.reset(seed=seed)
-        outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
-        return _some(outcomes or self.step({}))
-
-    def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """See Game."""
-        for _ in range(_MOST_IDLE_TURNS):
-            outcomes = self._step_once(actions)
-            if outcomes or self.is_over:
-                return outcomes
-        raise _idle()
-
-    def _step_once(self, actions: dict[str, Any]) -> list[Outcome]:
-        before = tuple(self._environment.agents)
-        chosen = {
-            agent: actions[agent] if agent in self._agents else self._others(agent, *self._seen[agent])
-            for agent in before
-        }
-        observations, rewards, terminated, truncated, infos = self._environment.step(chosen)
-        came = [agent for agent in self._environment.agents if agent not in before]
-        return self._outcomes((*before, *came), observations, rewards, terminated, truncated, infos)
-
-    @property
-    def is_over(self) -> bool:
-        """See Game."""
-        return not self._environment.agents
-
-    def _outcomes(
-        self,
-        agents: Sequence[str],
-        observations: Mapping[str, Any],
-        rewards: Mapping[str, float],
-        terminated: Mapping[str, bool],
-        truncated: Mapping[str, bool],
-        infos: Mapping[str, Any],
-    ) -> list[Outcome]:
-        missing = [agent for agent in agents if agent not in observations]
-        if missing:
-            raise EnvironmentSetupError(
-                f"there is no observation of {missing[0]} after its action: return one of each agent that acted, "
-                "also of those that leave with this step"
-            )
-        self._seen = {
-            agent: (observations[agent], infos.get(agent, {})) for agent in agents if agent not in self._agents
-        }
-        return [
-            Outcome(
-                agent,
-                observations[agent],
-                float(rewards.get(agent, 0.0)),
-                bool(terminated.get(agent, False)),
-                bool(truncated.get(agent, False)),
-                infos.get(agent, {}),
-            )
-            for agent in agents
-            if agent in self._agents
-        ]
 
 
 class GameEnvironments:
@@ -210,13 +55,14 @@ class GameEnvironments:
 
         Raises EnvironmentSetupError.
         """
-        self.name, self._environments, self.agents = name, list(copies), seats
+        self.name, self.agents = name, seats
+        self._environments = [without_checks(environment, spec) for environment in copies]
         self.seats = len(seats)
         self.count = len(copies) * len(seats)
         self._numbers = {agent: number for number, agent in enumerate(seats)}
         self._random = [np.random.default_rng(number) for number in range(len(copies))]
         self._others: dict[str, LegalActions] = {}  # of the agents without a seat
-        self._games = self.games_of(seats)
+        self._games = self.copies_for(seats)
         self._bots: list[Bot | None] = [None] * self.count  # of the seats, from the next match on
         self._in_match: list[Bot | None] = [None] * self.count
         self._newest: list[tuple[Any, Any]] = [(None, None)] * self.count  # observation and mask of each bot's seat
@@ -225,28 +71,36 @@ class GameEnvironments:
         self.observation_space = _with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
         self.action_space: gymnasium.Space = copies[0].action_space(seats[0])
         read = without(self.observation_space, spec.leave_out)
-        self._leaves = [leaf for leaf in leaves(read, "observation") if leaf.space.shape is not None]
         self.observations: Any = create_empty_array(self.observation_space, self.count)
+        self._leaves = [  # each with its array of the observations of all seats
+            (leaf, leaf.of(self.observations)) for leaf in leaves(read, "observation") if leaf.space.shape is not None
+        ]
         self._ended = np.zeros(self.count, np.bool_)
         self._acts = np.zeros(self.count, np.bool_)  # whether the seat has acted in this match
         self._warned = False
+        self.resting = np.zeros(len(copies), np.bool_)  # copies that do not begin another match
         self._episode_info = EpisodeInfo()
+        self._camera: Camera | None = None
         self.acting = np.zeros(self.count, np.bool_)
         self.action_mask: Any = None
         self._has_masks: bool | None = None  # in `info`; None before the first reset
         self.reset(0)
 
-    def games_of(self, agents: Sequence[str]) -> list[Game]:
-        """Return each copy as a game of these agents; the others take random legal actions."""
+    def copies_for(self, agents: Sequence[str]) -> list[GameCopy]:
+        """Return each copy as a game in which these agents have seats; the others take random legal actions."""
         return [
-            (_SimultaneousGame if _is_parallel(each) else _TurnGame)(each, agents, partial(self._random_action, number))
-            for number, each in enumerate(self._environments)
+            game_copy(environment, agents, partial(self._random_action, number))
+            for number, environment in enumerate(self._environments)
         ]
 
     @property
     def over(self) -> np.ndarray:
         """Whether the match of each copy has ended, [copies] bool."""
         return np.array([game.is_over for game in self._games])
+
+    def is_over(self, copy: int) -> bool:
+        """Return whether the match of a copy has ended."""
+        return self._games[copy].is_over
 
     def seat_bot(self, seat: int, bot: Bot | None) -> None:
         """Let a bot choose the actions of a seat from the next match of its copy on; None: the caller chooses them.
@@ -263,6 +117,7 @@ class GameEnvironments:
             self._random[number] = np.random.default_rng(seed + number)
             self._begin_match(number)
             self._note(number, self._call("reset", number, seed + number))
+        self._film()
         return self.observations
 
     def _begin_match(self, number: int) -> None:
@@ -280,24 +135,25 @@ class GameEnvironments:
         self._acts |= acted & ~self._ended
         for number, game in enumerate(self._games):
             if game.is_over:
+                if self.resting[number]:
+                    continue
                 self._begin_match(number)
                 outcomes = self._call("reset", number, None)
             else:
                 first = number * self.seats
-                chosen = {agent: self._chosen(actions, first + seat, acted) for agent, seat in self._numbers.items()}
+                chosen = {agent: self._chosen(actions, first + self._numbers[agent]) for agent in game.turns}
                 outcomes = self._call("step", number, chosen)
             for outcome in self._note(number, outcomes):
                 seat = number * self.seats + self._numbers[outcome.agent]
                 rewards[seat] = outcome.reward
                 terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
+        self._film()
         return self.observations, rewards, terminated, truncated
 
-    def _chosen(self, actions: Any, seat: int, acted: np.ndarray) -> Any:
-        """Return the action of a seat: its bot's, or the caller's."""
+    def _chosen(self, actions: Any, seat: int) -> Any:
+        """Return the action of a seat that must act: its bot's, or the caller's."""
         bot = self._in_match[seat]
-        if bot is None:
-            return _only(self.action_space, actions, seat)
-        return bot.act(*self._newest[seat]) if acted[seat] and not self._ended[seat] else None
+        return _only(self.action_space, actions, seat) if bot is None else bot.act(*self._newest[seat])
 
     def _call(self, call: str, number: int, argument: Any) -> list[Outcome]:
         try:
@@ -324,10 +180,9 @@ class GameEnvironments:
             self._ended[seat] = outcome.terminated or outcome.truncated
             if self._ended[seat]:
                 self._acts[seat] = False
-                scalars = {
-                    name: np.array([value]) for name, value in info_to_keep(dict(outcome.info), ended=True).items()
-                }
-                self._episode_info.add(scalars, np.array([True]))
+                if outcome.info:
+                    kept = info_to_keep(dict(outcome.info), ended=True)
+                    self._episode_info.add({name: np.array([kept[name]]) for name in kept}, np.array([True]))
             noted.append(outcome)
         return noted
 
@@ -336,17 +191,17 @@ class GameEnvironments:
         if self._agent_ids:
             parts = observation if isinstance(observation, Mapping) else {"observation": observation}
             observation = {**parts, _AGENT: self._numbers[outcome.agent]}
-        for leaf in self._leaves:
+        for leaf, written in self._leaves:
             try:
                 value = leaf.of(observation)
             except (KeyError, IndexError, TypeError, ValueError):
                 value = None
-            if value is None or value.shape != leaf.space.shape or (dtype_misfit(leaf.space, value)):
+            if value is None or value.shape != written.shape[1:] or dtype_misfit(leaf.space, value):
                 raise EnvironmentSetupError(
                     f"environment {self.name}: {outcome.agent} observes {described(observation)}, which is not of its "
                     f"space {described(self._of_game)}"
                 )
-            leaf.of(self.observations)[seat] = value
+            written[seat] = value
         self._write_mask(seat, outcome)
 
     def _write_mask(self, seat: int, outcome: Outcome) -> None:
@@ -393,6 +248,34 @@ class GameEnvironments:
             self._others[agent] = LegalActions(self._environments[0].action_space(agent))
         return self._others[agent].sample(_mask(observation, info), self._random[number])
 
+    def render(self) -> str | np.ndarray | None:
+        """Return the first copy as a text or an image [H, W, 3] uint8; None if the games were not made to be shown."""
+        environment = self._environments[0]
+        if getattr(environment, "render_mode", None) not in _SHOWN:
+            return None
+        try:
+            with USER_STATE:
+                shown = environment.render()
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise playing_error(self.name, "render", error) from error
+        if isinstance(shown, str) or (isinstance(shown, np.ndarray) and shown.ndim == 3):
+            return shown
+        return None
+
+    def film(self, camera: Camera) -> None:
+        """Pass an image of the first copy to a camera after each reset and each step from now on."""
+        self._camera = camera
+
+    def _film(self) -> None:
+        if self._camera is None:
+            return
+        picture = self.render()
+        if not isinstance(picture, np.ndarray):
+            raise EnvironmentSetupError(
+                f"environment {self.name} renders no image [height, width, 3]: a video of it cannot be recorded"
+            )
+        self._camera(picture, frame_rate(self._environments[0]))
+
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""
         return self._episode_info.take()
@@ -415,9 +298,37 @@ def close_copies(name: str, environments: Sequence[Any]) -> None:
         raise EnvironmentSetupError(f"environment {name}: close raises {first_line(errors[0])}") from errors[0]
 
 
-def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameEnvironments:
-    """Return `count` copies of the game that a specification names. Raises EnvironmentSetupError."""
-    copies = make_copies(spec, count, modules)
+def _mask(observation: Any, info: Any) -> Any:
+    """Return the mask of legal actions that a game gives with an observation, or None."""
+    mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
+    return info.get(MASK_KEY) if mask is None and isinstance(info, Mapping) else mask
+
+
+def make_games(
+    spec: EnvironmentSpec,
+    count: int,
+    modules: UserModules,
+    further: Callable[[tuple[str, ...]], int] = lambda _: 0,
+    *,
+    shown: bool = False,
+    render_mode: str | None = None,
+) -> GameEnvironments:
+    """Return copies of the game that a specification names.
+
+    Args:
+      spec: names the game.
+      count: of copies.
+      modules: the modules that may be imported for it.
+      further: returns how many copies more the seats demand.
+      shown: whether the copies render texts or images, if they can.
+      render_mode: in place of `shown`, how they must render: "rgb_array", or "human" for a window.
+
+    Raises EnvironmentSetupError, and what `further` raises.
+    """
+    make = _make_shown if shown else _make
+    if render_mode is not None:
+        make = partial(_make_rendered, mode=render_mode)
+    copies = make_copies(spec, count, modules, lambda game: further(_seats(game, spec)), make)
     try:
         return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
     except BaseException:
@@ -426,13 +337,24 @@ def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameE
         raise
 
 
-def make_copies(spec: EnvironmentSpec, count: int, modules: UserModules) -> list[Any]:
-    """Return `count` PettingZoo environments of one kind. Raises EnvironmentSetupError."""
+def make_copies(
+    spec: EnvironmentSpec,
+    count: int,
+    modules: UserModules,
+    further: Callable[[Any], int] = lambda _: 0,
+    make: Callable[[EnvironmentSpec, UserModules], Any] | None = None,
+) -> list[Any]:
+    """Return `count` PettingZoo environments of one kind, and as many more as `further` returns for the first.
+
+    `make` makes each of them, in place of what the specification says. See make_games.
+    """
     copies: list[Any] = []
     try:
-        for made in range(count):
-            with creation_errors(spec.id, hint_of_count(made, count)):
-                copies.append(_make(spec, modules))
+        while len(copies) < count:
+            with creation_errors(spec.id, hint_of_count(len(copies), count)):
+                copies.append((make or _make)(spec, modules))
+            if len(copies) == 1:
+                count += further(copies[0])
     except BaseException:
         for each in copies:
             each.close()
@@ -440,7 +362,43 @@ def make_copies(spec: EnvironmentSpec, count: int, modules: UserModules) -> list
     return copies
 
 
-def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
+def _make_shown(spec: EnvironmentSpec, modules: UserModules) -> Any:
+    """Return a game that renders itself as a text or an image if it can: it says so in its metadata."""
+    render_without_display()
+    environment = _make(spec, modules)
+    modes = getattr(environment, "metadata", {}).get("render_modes", ())
+    mode = next((mode for mode in _SHOWN if mode in modes), None)
+    if mode is None or "render_mode" in spec.constructor_kwargs:
+        return environment
+    try:
+        rendered = _make(spec, modules, render_mode=mode)
+    except (Exception, SystemExit) as error:  # of the user's code: its function need not have this argument
+        _logger.warning("environment %s cannot be made with render_mode=%r: %s", spec.id, mode, first_line(error))
+        return environment
+    environment.close()
+    return rendered
+
+
+def _make_rendered(spec: EnvironmentSpec, modules: UserModules, mode: str) -> Any:
+    """Return a game in a render mode. Raises EnvironmentSetupError if it has none."""
+    if mode == "rgb_array":
+        render_without_display()
+    try:
+        environment = _make(spec, modules, render_mode=mode)
+    except TypeError as error:
+        if "keyword argument 'render_mode'" not in str(error):
+            raise
+        reason = "what makes it has no argument render_mode"
+    else:
+        modes = tuple(getattr(environment, "metadata", {}).get("render_modes", ()))
+        if mode in modes:
+            return environment
+        environment.close()
+        reason = f"its metadata state the render_modes {', '.join(map(str, modes)) or 'none'}"
+    raise EnvironmentSetupError(f"environment {spec.id} cannot render {mode} images: {reason}")
+
+
+def _make(spec: EnvironmentSpec, modules: UserModules, **options: Any) -> Any:
     module_name, colon, function = spec.id.partition(":")
     if colon:
         try:
@@ -453,7 +411,7 @@ def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
         function = "env"
     if not callable(make):
         raise EnvironmentSetupError(f"environment {spec.id}: there is no function {function}() that makes the game")
-    environment = make(**spec.constructor_kwargs)
+    environment = make(**{**spec.constructor_kwargs, **options})
     if not hasattr(environment, "possible_agents"):
         raise EnvironmentSetupError(
             f"environment {spec.id} made {type(environment).__name__}, which has no possible_agents: "
@@ -477,10 +435,6 @@ def _module(name: str) -> Any:
         if error.name is not None and name.startswith(error.name):
             raise EnvironmentSetupError(f"unknown game {name!r}: {first_line(error)}") from None
         raise
-
-
-def _is_parallel(environment: Any) -> bool:
-    return not hasattr(environment, "agent_iter")
 
 
 def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.games import Game, GameEnvironments, Outcome, close_copies, make_copies
+from daedalus.actor.environments.game_copies import GameCopy, Outcome
+from daedalus.actor.environments.games import GameEnvironments, close_copies, make_copies
 from daedalus.actor.environments.roles import agents_named, listed
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
@@ -26,7 +27,7 @@ _MADE_FROM = ("id", "backend", "kwargs", "training_kwargs")  # settings that dec
 class _Copy:
     """One copy of the game, and what its runs still have to see and to answer. The lock of SharedGames guards it."""
 
-    def __init__(self, game: Game, run_of: Mapping[str, str], seed: int) -> None:
+    def __init__(self, game: GameCopy, run_of: Mapping[str, str], seed: int) -> None:
         """`run_of` is the run of each agent that one plays; `seed` is that of the first match."""
         self.game, self._run_of = game, run_of
         self._seed: int | None = seed  # None: the first match has begun
@@ -53,20 +54,30 @@ class _Copy:
 
 
 class _SeatsOfCopy:
-    """The Game that one run plays in a copy: its calls return what is new for the run, which may be nothing yet."""
+    """The GameCopy that one run plays: its calls return what is new for the run, which may be nothing yet."""
 
-    def __init__(self, copy: _Copy, run: str) -> None:
-        self._copy, self._run = copy, run
+    def __init__(self, copy: _Copy, run: str, agents: Sequence[str]) -> None:
+        self._copy, self._run, self._agents = copy, run, frozenset(agents)
 
     def reset(self, seed: int | None) -> list[Outcome]:
-        """See Game. The first match has the seed of the copy."""
+        """See GameCopy. The first match has the seed of the copy."""
         self._copy.begin()
         return self.step({})
 
-    def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """See Game. The actions are the answer to what was returned last; they have no effect before that."""
+    @property
+    def turns(self) -> Sequence[str]:
+        """See GameCopy."""
+        return [agent for agent in self._copy.game.turns if agent in self._agents] if self._is_awaited else ()
+
+    @property
+    def _is_awaited(self) -> bool:
+        """Whether the run has taken what is new, and must answer."""
+        return self._run in self._copy.awaited and self._run not in self._copy.news
+
+    def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
+        """See GameCopy. The actions are the answer to what was returned last; they have no effect before that."""
         copy, run = self._copy, self._run
-        if run not in copy.news and run in copy.awaited:
+        if self._is_awaited:
             copy.chosen.update(actions)
             copy.awaited.remove(run)
             copy.go_on()
@@ -74,7 +85,7 @@ class _SeatsOfCopy:
 
     @property
     def is_over(self) -> bool:
-        """See Game."""
+        """See GameCopy."""
         return self._copy.game.is_over
 
 
@@ -97,7 +108,8 @@ class RoleEnvironments(GameEnvironments):
         if not self._begins:
             self._begins = True
             return super().reset(seed)
-        self._games = [_SeatsOfCopy(copy, self._run) for copy in self._shared.begin(self._run, seed, self.on_wait)]
+        copies = self._shared.begin(self._run, seed, self.on_wait)
+        self._games = [_SeatsOfCopy(copy, self._run, self.agents) for copy in copies]
         with self._shared.playing():
             return super().reset(seed)
 
@@ -231,7 +243,7 @@ class SharedGames:
         run_of = {agent: run for run, agents in self._agents.items() for agent in agents}
         seeds = np.random.SeedSequence([self._seeds[run] for run in sorted(self._seeds)])
         first = int(seeds.generate_state(1)[0]) // 2  # below 2**31: see EnvironmentCollector
-        games = self._others.games_of(tuple(run_of))
+        games = self._others.copies_for(tuple(run_of))
         return [_Copy(game, run_of, max(first - len(games), 0) + number) for number, game in enumerate(games)]
 
     @contextmanager

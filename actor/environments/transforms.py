@@ -161,6 +161,11 @@ class TransformedEnvironment:
         return self._transforms.spaces
 
     @property
+    def games(self) -> GameEnvironments | None:
+        """See VectorEnvironment."""
+        return self._games
+
+    @property
     def seats(self) -> int:
         """See VectorEnvironment."""
         return self._games.seats if self._games is not None else 1
@@ -213,6 +218,11 @@ class TransformedEnvironment:
                 ignored[0],
             )
         return np.where(resets, 0.0, rewards)
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """The agents of the seats of each game; empty if there are no games."""
+        return () if self._games is None else self._games.agents
 
     @property
     def action_names(self) -> tuple[str, ...]:

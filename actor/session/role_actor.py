@@ -9,14 +9,16 @@ from functools import partial
 from pathlib import Path
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.collecting.lineup import sides_of
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.games import GameEnvironments
 from daedalus.actor.environments.shared_games import RoleEnvironments, SharedGames
-from daedalus.actor.environments.transforms import TransformedEnvironment
-from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.actor_service import ActorService
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
@@ -56,8 +58,11 @@ class RoleCollector(EnvironmentCollector):
       on_wait: see RoleEnvironments.
     """
 
-    def __init__(self, games: SharedGames, run: str) -> None:
-        super().__init__()
+    def __init__(
+        self, games: SharedGames, run: str, count: int | None = None, modules: UserModules = NO_MODULES
+    ) -> None:
+        """Join the games with the first `prepare`. `count` and `modules` are those of the games."""
+        super().__init__(count, modules)
         self._shared, self._run = games, run
         self._seats: RoleEnvironments | None = None
         self._spec: ActorSpec | None = None
@@ -82,9 +87,14 @@ class RoleCollector(EnvironmentCollector):
     def _changed(self) -> ActorError:
         return ActorError(f"the run {self._run!r} has other settings than before: start this actor again")
 
-    def _make(self, spec: ActorSpec) -> VectorEnvironment:
+    def _games(self, spec: ActorSpec, count: int) -> GameEnvironments:
         self._seats = self._shared.join(self._run, spec)
-        return TransformedEnvironment(self._seats, spec.environment)
+        if len(sides_of(spec.league, self._seats.agents)) > 1:
+            raise EnvironmentSetupError(
+                f"the run {self._run!r} shares its games with other runs, so its own agents are one side: set "
+                f"league.sides=[{list(self._seats.agents)}]"
+            )
+        return self._seats
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. A learner that has returned finds the matches under way, with the memory of its seats."""
@@ -200,7 +210,7 @@ class RoleActor:
         self._games = SharedGames({each.run: each.names for each in seatings}, config.environments, config.modules)
         self._roles: list[_Role] = []
         for each in seatings:
-            collector = RoleCollector(self._games, each.run)
+            collector = RoleCollector(self._games, each.run, config.environments, config.modules)
             role = _Role(each, collector, self._check)
             if each.policy is None:
                 own = replace(config, name=keys.as_name(f"{config.name}.{'-'.join(each.names)}"), run=each.run)
