@@ -21,8 +21,8 @@ class DifferentSpacesError(EnvironmentSetupError):
         first = list(next(iter(roles.values())))
         super().__init__(
             f"the agents of {game} have different spaces ({parts}), and one policy plays agents with the same ones: "
-            f"`daedalus train --env {game}` starts a learner for each role ({', '.join(roles)}), or choose one role, "
-            f'as in --set "environment.agents={first}"; the others then take random actions'
+            f"`daedalus train` starts a learner for each role ({', '.join(roles)}) if environment.agents is unset, or "
+            f'choose one role, as in --set "environment.agents={first}"; the others then take random actions'
         )
         self.roles = dict(roles)
 
