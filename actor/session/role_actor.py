@@ -1,6 +1,7 @@
 """One actor whose seats belong to several runs: the games are shared, and each run has its own session and thread."""
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -182,7 +183,7 @@ class _Role:
             raise ActorError(
                 f"the seats {self.seating.description} have {spaces}; {saved.directory} has {saved.spaces}"
             )
-        self.collector.begin(OnnxRuntime(saved.program), spec, seed=time.time_ns())
+        self.collector.begin(OnnxRuntime(saved.program), spec, seed=secrets.randbits(64))
         self.collector.load(
             Snapshot(learner_epoch=0, policy_version=saved.policy_version, program="", weights=saved.weights)
         )
