@@ -13,7 +13,6 @@ from rich.text import Text
 
 from daedalus.cli.run_watcher import WatchedRun
 from daedalus.learner.reporting.progress import duration
-from daedalus.protocol.league import NEWEST, LeagueStatus
 from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.protocol.texts import one_line, policy_lag, short_number, short_rate
 
@@ -70,7 +69,8 @@ def _run(run: WatchedRun, width: int, lines: int, ascii_only: bool) -> list[Rend
     status = run.status
     notes = [_line([f"PROBLEM: {problem}"], width, "yellow") for problem in status.problems[:_SHOWN_PROBLEMS]]
     notes += [_line([status.bottleneck], width)] if status.bottleneck else []
-    notes += _wins(status.league, width)
+    rates = [f"{name} {rate:.0%}" for name, rate in status.league.win_rates.items()] if status.league else []
+    notes += [_line(["newest wins against", *rates], width)] if rates else []
     lines = max(lines - len(notes), 0)
     shown = status.actors[:lines]
     more = status.fleet_size - len(shown)
@@ -124,15 +124,6 @@ def _strength(status: RunStatus) -> str:
     if status.league and (newest := status.league.newest):
         return f"rating {short_number(newest.rating):>8} +- {short_number(newest.deviation)}"
     return f"return {'-' if status.episode_return_mean is None else short_number(status.episode_return_mean):>8}"
-
-
-def _wins(league: LeagueStatus | None, width: int) -> list[RenderableType]:
-    """Return the line of the win rates against the fixed opponents, if there are any."""
-    scores = league.scores_of(NEWEST) if league else {}
-    rates = [
-        f"{name} {scores[name].win_rate:.0%}" for name in (league.fixed_opponents if league else ()) if name in scores
-    ]
-    return [_line(["newest wins against", *rates], width)] if rates else []
 
 
 def _actors(actors: Sequence[ActorStatus], width: int, updates_per_batch: int) -> Table:

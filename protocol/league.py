@@ -32,7 +32,7 @@ def version_name(policy_version: int) -> str:
 
 def is_version(player: str) -> bool:
     """Return whether a player is a kept version of the policy."""
-    return re.fullmatch(r"v\d+", player) is not None
+    return re.fullmatch(r"v(0|[1-9]\d{0,18})", player, re.ASCII) is not None
 
 
 class MatchCount(Specification):
@@ -128,6 +128,12 @@ class LeagueStatus(Specification):
     def fixed_opponents(self) -> list[str]:
         """Names of the opponents that are neither the newest policy nor versions of it."""
         return [each.player for each in self.players if each.player != NEWEST and not is_version(each.player)]
+
+    @property
+    def win_rates(self) -> dict[str, float]:
+        """Win rate of the newest policy against each fixed opponent that it has played. See Score.win_rate."""
+        scores = self.scores_of(NEWEST)
+        return {name: scores[name].win_rate for name in self.fixed_opponents if name in scores}
 
     def scores_of(self, player: str) -> Mapping[str, Score]:
         """Return the results of a player against each other one that it has played, by the other's name."""

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from daedalus.protocol.keys import as_name
-from daedalus.protocol.league import NEWEST, LeagueStatus
+from daedalus.protocol.league import LeagueStatus
 
 # By the group that TensorBoard shows them in. docs/reference/metrics.md explains each column.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -131,8 +131,7 @@ def league_columns(league: LeagueStatus) -> dict[str, float]:
     newest = league.newest
     if newest is None:
         return {}
-    scores = league.scores_of(NEWEST)
-    rates = {_opponent_column(name): scores[name].win_rate for name in league.fixed_opponents if name in scores}
+    rates = {_opponent_column(name): rate for name, rate in league.win_rates.items()}
     return {"rating": newest.rating, "rating_deviation": newest.deviation, **rates}
 
 
