@@ -8,9 +8,9 @@ from contextlib import suppress
 from typing import Any
 
 import gymnasium
-import numpy as np
 from gymnasium.utils.env_checker import check_env
 
+from daedalus.actor.environments.bots import RandomActions
 from daedalus.actor.environments.components import is_text, leaves
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
 from daedalus.actor.environments.gymnasium_backend import registration
@@ -18,32 +18,7 @@ from daedalus.actor.environments.info import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec
-
-
-class RandomActions:
-    """A policy that draws every action at random from those that are legal."""
-
-    def __init__(self, spaces: dict[str, ActionSpace], seed: int) -> None:
-        self._spaces = spaces
-        self._random = np.random.default_rng(seed)
-
-    def choose(self, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return actions {name: [1, D]}, given the masks {name: [1, choices]} of the components that have masks."""
-        return {name: self._values(space, masks.get(name))[None] for name, space in self._spaces.items()}
-
-    def _values(self, space: ActionSpace, mask: np.ndarray | None) -> np.ndarray:
-        match space:
-            case DiscreteSpace():
-                legal = np.ones(space.choices, np.bool_) if mask is None else mask[0]
-                parts = np.split(legal, np.cumsum(space.counts)[:-1])
-                return np.array([self._random.choice(np.flatnonzero(part)) for part in parts])
-            case ContinuousSpace():
-                bounded = [None not in bounds for bounds in zip(space.low, space.high, strict=True)]
-                uniform, normal = self._random.uniform(-1.0, 1.0, space.size), self._random.standard_normal(space.size)
-                return np.where(bounded, uniform, normal).astype(np.float32)
-
 
 _RESETS, _SECONDS = 20, 2.0  # the most resets, and the time for those after the second
 _SHOWN = 60  # characters of a text in a message

@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import RandomActions
 from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.environments.bots import RandomActions
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import make_games

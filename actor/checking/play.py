@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import RandomActions, Texts
+from daedalus.actor.checking.checker import Texts
 from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
@@ -21,6 +21,7 @@ from daedalus.actor.checking.violations import (
     reset_violations,
     step_violations,
 )
+from daedalus.actor.environments.bots import RandomActions
 from daedalus.actor.environments.components import batch_of_one, only_of_batch, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import make_single, uses_vector_entry_point

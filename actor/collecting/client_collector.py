@@ -30,6 +30,8 @@ class ClientCollector:
     each update, a rollout is of all agents, as that of an actor with as many environments.
     """
 
+    lineup = None  # the caller decides who plays
+
     def __init__(
         self,
         observation_space: gymnasium.Space,

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol
 
+from daedalus.actor.collecting.lineup import Lineup
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
@@ -12,6 +13,11 @@ from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 class Collector(Protocol):
     """A source of rollouts for one learner after the other. Its methods are for the service's thread."""
+
+    @property
+    def lineup(self) -> Lineup | None:
+        """Who plays the seats of the games that it steps; None if it steps none, and before `prepare`."""
+        ...
 
     def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
         """Prepare for a run, and return its spaces and E, the number of environments.

@@ -1,53 +1,90 @@
 """Rollouts from environments that the actor creates and steps itself. No network, no threads."""
 
+import logging
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
+from daedalus.actor.collecting.lineup import Lineup, rating_copies
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, SeatWriter
+from daedalus.actor.environments.bots import make_bot
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
-from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import ActorSpec, EnvironmentSpec
+from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _SEEDS = 2**31  # every seed of an environment is below it: many environments pass theirs to a C int
+
+_logger = logging.getLogger(__name__)
 
 
 class EnvironmentCollector:
     """A Collector that creates environments as the run specifies and steps them.
 
     A rollout's arrays are views of the collector's: encode or copy the rollout before the next `collect`.
+
+    Attributes:
+      lineup: who plays the seats of games; None for environments with one agent.
     """
 
     def __init__(self, count: int | None = None, modules: UserModules = NO_MODULES) -> None:
         """Create no environments yet.
 
         Args:
-          count: E, the number of environments; None: as many as the run specifies.
-          modules: the modules that may be imported for environments.
+          count: E, the number of environments, or of copies of a game; None: as many as the run specifies.
+          modules: the modules that may be imported for environments and opponents.
         """
         self._count, self._modules = count, modules
         self._environments: VectorEnvironment | None = None
-        self._requested: tuple[EnvironmentSpec, int] | None = None  # a backend may make fewer than this number
+        self.lineup: Lineup | None = None
+        self._requested: object = None  # what the environments were made for: a backend may make fewer of them
         self._runtime: PolicyRuntime | None = None
         self._writer: RolloutWriter | None = None
         self._policy_version = -1
 
     def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
-        """See Collector. Reuse the environments of an earlier run with the same specification and number of them."""
+        """See Collector. Reuse the environments of an earlier run with the same specification and number of them.
+
+        Of games the number is that of the columns of a rollout.
+        """
         count = self._count or spec.collection.envs_per_actor
-        requested = (spec.environment, count)
+        requested = (spec.environment, spec.league, count)
         if self._requested != requested:
             self.close()
         if self._environments is None:
-            self._environments = make_environments(spec.environment, count, modules=self._modules)
+            if spec.environment.is_game:
+                self._make_games(spec, count)
+            else:
+                self._environments = make_environments(spec.environment, count, modules=self._modules)
             self._requested = requested
-        return self._environments.spaces, self._environments.count
+        environments = self._environments
+        assert environments is not None
+        return environments.spaces, environments.count if self.lineup is None else self.lineup.columns
+
+    def _make_games(self, spec: ActorSpec, count: int) -> None:
+        try:
+            self._modules.check({**spec.environment.user_modules, **spec.league.user_modules})
+        except UserModuleError as error:
+            raise EnvironmentSetupError(str(error)) from None
+        games = make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league))
+        try:
+            self.lineup = Lineup(
+                spec.league, games, count, lambda name: make_bot(name, games.action_space, self._modules)
+            )
+            self._environments = TransformedEnvironment(games, spec.environment)
+        except EnvironmentSetupError:
+            games.close()
+            raise
+        if line := self.lineup.describe():
+            _logger.info("%s", line)
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Reset the environments."""
@@ -55,10 +92,12 @@ class EnvironmentCollector:
         assert environments is not None
         environment_seed, *action_seed = np.random.SeedSequence(seed).generate_state(4).tolist()  # of 32 bits each
         self._runtime = runtime
-        writer = partial(SeatWriter, seats=environments.seats) if spec.environment.is_game else RolloutWriter
-        self._writer = writer(
-            environments.spaces,
-            environments.count,
+        if self.lineup is not None:
+            make_writer = partial(SeatWriter, environments.spaces, self.lineup, environments.seats)
+            self.lineup.begin(np.random.default_rng([*action_seed, 1]))
+        else:
+            make_writer = partial(RolloutWriter, environments.spaces, environments.count)
+        self._writer = make_writer(
             runtime,
             spec.environment,
             rollout_length=spec.collection.rollout_length,
@@ -90,4 +129,4 @@ class EnvironmentCollector:
         """See Collector. Close the environments."""
         if self._environments is not None:
             self._environments.close()
-        self._environments = self._requested = self._runtime = self._writer = None
+        self._environments = self._requested = self._runtime = self._writer = self.lineup = None

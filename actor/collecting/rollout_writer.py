@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from daedalus.actor.collecting.lineup import Lineup
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.vector_environments import Observed
 from daedalus.policy.acting.noise import Noise, draw_noise
@@ -48,14 +49,18 @@ class EpisodeCounter:
             self._returns[self.ended] = 0.0
             self._lengths[self.ended] = 0
 
-    def step_seats(self, acted: np.ndarray, rewards: np.ndarray, ended: np.ndarray) -> None:
-        """Count a step of the seats that `acted`, with their rewards, and whether their episodes `ended`; all [E]."""
+    def step_seats(self, acted: np.ndarray, rewards: np.ndarray, ended: np.ndarray, counted: np.ndarray) -> None:
+        """Count a step of the seats that `acted`, with their rewards, and whether their episodes `ended`; all [E].
+
+        `counted`: whose episodes are reported.
+        """
         valid = acted & ~self.ended
         self._returns[valid] += rewards[valid]
         self._lengths += valid
         ended = valid & ended
         if np.count_nonzero(ended):
-            self._finished.append((self._returns[ended], self._lengths[ended]))
+            reported = ended & counted
+            self._finished.append((self._returns[reported], self._lengths[reported]))
             self._returns[ended] = 0.0
             self._lengths[ended] = 0
         self.ended = np.where(acted, ended, self.ended)
@@ -285,86 +290,124 @@ class RolloutWriter:
 class SeatWriter(RolloutWriter):
     """A RolloutWriter of the seats of games, each with rows of its own: see Observed.acting.
 
-    A row goes from an action of the seat to its next observation, however many steps of the game that takes. A seat
-    whose rows are full plays on without them until those of all seats are full.
+    A row goes from an action of the seat to its next observation, however many steps of the game that takes. A column
+    whose rows are full is not written until those of all columns are full, while its seat plays on. Only the seats of
+    the newest policy have columns, and not always the same ones: see Lineup.
     """
 
-    def __init__(self, *arguments: Any, seats: int, **options: Any) -> None:
-        """`seats` is the number of seats of each game; for the others see RolloutWriter."""
-        super().__init__(*arguments, **options)
-        self._seats = seats
-        self._rows = np.zeros(self._count, np.int64)  # [E] that are written
-        self._begun = np.zeros(self._count, np.bool_)  # [E] whether the seat has had an observation
-        self._acting = np.zeros(self._count, np.bool_)
-        self._writing = np.zeros(self._count, np.bool_)  # [E] whether the row that the seat has begun is written
+    def __init__(self, spaces: Spaces, lineup: Lineup, seats: int, *arguments: Any, **options: Any) -> None:
+        """Construct the writer of all `seats` of each game; for the other arguments see RolloutWriter."""
+        super().__init__(spaces, lineup.columns, *arguments, **options)
+        self._lineup, self._seats = lineup, seats
+        total = len(lineup.column)
+        # Of each column:
+        self._rows = np.zeros(self._count, np.int64)  # that are written
+        self._writing = np.zeros(self._count, np.bool_)  # whether the row that its seat has begun is written
+        self._resets = np.zeros(self._count, np.bool_)  # whether that row only resets
+        # Of each seat:
+        self._stacks, self._episodes = ObservationStacks(spaces, total), EpisodeCounter(total)
+        self._epsilon = np.full((total, 1), options.get("epsilon", 0.0), np.float32)
+        self._state = np.zeros((total, self._runtime.state_size), np.float32)
         self._next_state = np.zeros_like(self._state)
-        self._chosen = {name: np.zeros_like(actions[0]) for name, actions in self._actions.items()}
+        self._acting, self._begun = np.zeros((2, total), np.bool_)  # has something new; has had an observation
+        self._deciding = np.zeros(0, np.int64)  # the seats that the newest policy acts for in this row
+        self._chosen = {
+            name: np.zeros((total, *actions.shape[2:]), actions.dtype) for name, actions in self._actions.items()
+        }
+        self._over = np.ones(total // seats, np.bool_)  # of each copy: whether its next step is a reset
         self._env_steps = self._skipped = 0  # of this rollout; rows that were not written
         self._warned = False
 
     def start(self, observed: Observed) -> None:
         """See RolloutWriter."""
+        self._take_seats(observed)
         self._show(observed)
 
     def act(self) -> dict[str, np.ndarray]:
         """See RolloutWriter. Only those of the acting seats have an effect."""
-        super().act()
+        inputs = self.begin_row()
+        if len(self._deciding):
+            choice = self._runtime.act(inputs.observations, inputs.state, inputs.noise, inputs.masks, inputs.epsilon)
+            self.take_choice(choice)
+        self._lineup.act(self._acting, self._stacks, self._current_masks, self._chosen)
         return self._chosen
 
     def begin_row(self) -> RowInputs:
-        """See RolloutWriter. The inputs are those of the acting seats."""
-        acting = self._acting
-        writing = acting & (self._rows < len(self._rewards))
-        first = writing & (self._rows == 0)
+        """See RolloutWriter. The inputs are those of the acting seats of the newest policy."""
+        seats = self._deciding = np.flatnonzero(self._acting & self._lineup.is_newest)
+        columns = self._lineup.column[seats]
+        learned = columns >= 0
+        if not learned.all():
+            seats, columns = seats[learned], columns[learned]
+        rows = self._rows[columns]
+        writes = rows < len(self._rewards)
+        self._writing[columns] = writes
+        self._resets[columns] = self._episodes.ended[seats]
+        first = rows == 0
         if np.count_nonzero(first):
             for name, frames in self._stacks.frames.items():
-                self._frames[name][: self._depths[name], first] = frames[first].swapaxes(0, 1)
-            self._initial_state[first] = self._state[first]
-        self._writing[acting] = writing[acting]
-        valid = writing & ~self._episodes.ended
-        self._env_steps += int(np.count_nonzero(valid.reshape(-1, self._seats).any(axis=1)))
-        self._skipped += int(np.count_nonzero(acting & ~writing))
+                self._frames[name][: self._depths[name], columns[first]] = frames[seats[first]].swapaxes(0, 1)
+            self._initial_state[columns[first]] = self._state[seats[first]]
+        valid = seats[writes & ~self._episodes.ended[seats]]
+        self._env_steps += len(np.unique(valid // self._seats))
+        self._skipped += len(writes) - int(np.count_nonzero(writes))
         self._refuse_absent_seats()
+        seats = self._deciding
         return RowInputs(
-            {name: values[acting] for name, values in self._stacks.observations.items()},
-            self._state[acting],
-            {name: masks[acting] for name, masks in self._current_masks.items()},
-            self._epsilon[acting],
-            draw_noise(self._runtime.noise_size, int(np.count_nonzero(acting)), self._random),
+            {name: values[seats] for name, values in self._stacks.observations.items()},
+            self._state[seats],
+            {name: masks[seats] for name, masks in self._current_masks.items()},
+            self._epsilon[seats],
+            self._lineup.noise(self._runtime.noise_size, seats, self._random),
         )
 
     def take_choice(self, choice: Choice) -> None:
         """See RolloutWriter."""
-        columns = np.flatnonzero(self._writing & self._acting)
-        rows, chosen = self._rows[columns], self._writing[self._acting]  # of the choices: those that are written
+        seats = self._deciding
+        columns = self._lineup.column[seats]
+        chosen = columns >= 0
+        chosen[chosen] = self._writing[columns[chosen]]  # of the choices: those that are written
+        columns = columns[chosen]
+        rows = self._rows[columns]
         self._log_probs[rows, columns] = choice.log_probs[chosen]
-        self._next_state[self._acting] = choice.state
+        self._next_state[seats] = choice.state
         for name, actions in self._actions.items():
             actions[rows, columns] = choice.actions[name][chosen]
-            self._chosen[name][self._acting] = choice.actions[name]
+            self._chosen[name][seats] = choice.actions[name]
         for name, masks in self._masks.items():
-            masks[rows, columns] = self._current_masks[name][columns]
+            masks[rows, columns] = self._current_masks[name][seats[chosen]]
 
     def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
         """See RolloutWriter."""
         assert observed.acting is not None
+        assert observed.over is not None
+        was_over = self._over
+        self._take_seats(observed)
+        resets = self._episodes.ended
         acted = observed.acting & self._begun  # seats whose action has an outcome
-        columns = np.flatnonzero(acted & self._writing)
-        rows, resets = self._rows[columns], self._episodes.ended
+        # A column may go on with another seat after a row that resets.
+        seats = np.flatnonzero(observed.acting & (self._lineup.column >= 0))
+        columns = self._lineup.column[seats]
+        written = self._writing[columns]
+        seats, columns = seats[written], columns[written]
+        rows, valid = self._rows[columns], ~self._resets[columns]
         for name, frames in self._frames.items():
-            frames[self._depths[name] + rows, columns] = observed.frames[name][columns]
-        self._rewards[rows, columns] = rewards[columns]
-        self._terminated[rows, columns] = terminated[columns]
-        self._truncated[rows, columns] = truncated[columns]
-        self._valid[rows, columns] = ~resets[columns]
+            frames[self._depths[name] + rows, columns] = observed.frames[name][seats]
+        self._rewards[rows, columns] = np.where(valid, rewards[seats], 0.0)
+        self._terminated[rows, columns] = terminated[seats] & valid
+        self._truncated[rows, columns] = truncated[seats] & valid
+        self._valid[rows, columns] = valid
         self._rows[columns] += 1
+        self._writing[columns] = False
         if self._state.size:
             goes_on = ~resets & np.isfinite(self._next_state).all(axis=1)
             self._state[acted] = np.where(goes_on[:, None], self._next_state, np.float32(0.0))[acted]
         self._show(observed)
+        rewards = rewards.astype(np.float32)
+        counted = self._lineup.column >= 0
+        self._lineup.step(acted & ~resets, rewards, np.flatnonzero(observed.over & ~was_over).tolist())
         # Also those that are not written: the agents who act most often would have too few results in the mean.
-        self._episodes.step_seats(acted, rewards.astype(np.float32), terminated | truncated)
-        self._writing[acted] = False
+        self._episodes.step_seats(acted, rewards, terminated | truncated, counted)
         return bool((self._rows == len(self._rewards)).all())
 
     def finish(
@@ -378,10 +421,25 @@ class SeatWriter(RolloutWriter):
                 "more than half of the agents' steps are not learned from, for some agents act much more often than "
                 "others: each has as many rows in a rollout (environment.agents chooses the agents)"
             )
-        rollout = replace(rollout, game_steps=self._env_steps)
+        rollout = replace(rollout, game_steps=self._env_steps, matches=self._lineup.take_matches())
         self._rows[:] = 0
         self._env_steps = self._skipped = 0
         return rollout
+
+    def _take_seats(self, observed: Observed) -> None:
+        """Let the players of matches that have begun take their seats."""
+        assert observed.over is not None
+        began = self._over & ~observed.over
+        if np.count_nonzero(began):
+            columns = self._lineup.column[np.repeat(began, self._seats)]
+            columns = columns[columns >= 0]
+            if (self._writing[columns] & ~self._resets[columns]).any():
+                raise EnvironmentSetupError(
+                    "a match of the game ended, and an agent that acted in it saw no end: each agent must have a last "
+                    "observation with its termination or truncation"
+                )
+            self._lineup.seat(np.flatnonzero(began).tolist())
+        self._over = observed.over
 
     def _show(self, observed: Observed) -> None:
         """Take what the seats show after a reset or a step."""
@@ -394,7 +452,8 @@ class SeatWriter(RolloutWriter):
     def _refuse_absent_seats(self) -> None:
         if self._skipped <= _MOST_SKIPPED * self._rewards.size:
             return
-        seat = int(np.argmin(self._rows)) % self._seats
+        column = int(np.argmin(self._rows))
+        seat = int(np.argmax(self._lineup.column == column)) % self._seats
         raise EnvironmentSetupError(
             f"agent number {seat} of the game hardly ever acts: the others took {self._skipped:,} steps that are not "
             "learned from, while its rows of one rollout were not full; leave it out with environment.agents"

@@ -1,19 +1,21 @@
 """Backend `pettingzoo`: environments with several agents, each of which is a seat with rows of its own.
 
-A copy of the game is stepped until some of its seats must act. Agents that act together, in turns, leave early or
-appear late are then one case: each step says which seats have something new.
+A copy of the game is stepped until some of its seats must act (game_copies.py). Agents that act together, in turns,
+leave early or appear late are then one case: each step says which seats have something new.
 """
 
 import importlib
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from functools import partial
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.vector.utils import create_empty_array
 
+from daedalus.actor.environments.bots import Bot, LegalActions
 from daedalus.actor.environments.components import dtype_misfit, leaves, without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
@@ -23,162 +25,19 @@ from daedalus.actor.environments.environment_errors import (
     import_extra,
     playing_error,
 )
+from daedalus.actor.environments.game_copies import Outcome, game_copy
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
+from daedalus.actor.environments.rendering import render_without_display
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
+_SHOWN = ("ansi", "rgb_array")  # render modes, the best first
 _AGENT = "agent"  # component of the observation with environment.agent_ids
 _MOST_NAMES = 6  # of agents in a message
-_MOST_IDLE_TURNS = 100_000  # of agents that the policy does not play, between two turns of its seats
 
 _logger = logging.getLogger(__name__)
-
-
-class Outcome(NamedTuple):
-    """What is new for one agent: an observation to act on, or the last one of its episode."""
-
-    agent: str
-    observation: Any
-    reward: float  # since its last action
-    terminated: bool
-    truncated: bool
-    info: Mapping[str, Any]
-
-
-class _Game(Protocol):
-    """One copy of a game, whichever of PettingZoo's two interfaces it has."""
-
-    def reset(self, seed: int | None) -> list[Outcome]:
-        """Begin a match, and return what is new for its first agents."""
-        ...
-
-    def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """Play on with the actions of the agents that must act, until an agent of ours has something new."""
-        ...
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the match has ended for all agents."""
-        ...
-
-
-class _TurnGame:
-    """A game whose agents act one after the other (PettingZoo's AEC interface)."""
-
-    def __init__(self, environment: Any, agents: Sequence[str], others: Callable[[str, Any, Any], Any]) -> None:
-        self._environment, self._agents, self._others = environment, frozenset(agents), others
-        self._turn: str | None = None  # the agent of ours that must act
-
-    def reset(self, seed: int | None) -> list[Outcome]:
-        """See _Game."""
-        self._environment.reset(seed=seed)
-        self._turn = None
-        return self._advance()
-
-    def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """See _Game."""
-        if self._turn is not None:
-            action, self._turn = actions[self._turn], None
-            self._environment.step(action)
-        return self._advance()
-
-    @property
-    def is_over(self) -> bool:
-        """See _Game."""
-        return not self._environment.agents
-
-    def _advance(self) -> list[Outcome]:
-        """Return what is new up to the next turn of an agent of ours, at most once for each agent."""
-        environment, outcomes = self._environment, dict[str, Outcome]()
-        for _ in range(_MOST_IDLE_TURNS):
-            if self.is_over:
-                return list(outcomes.values())
-            agent = environment.agent_selection
-            if agent in outcomes:  # the next call passes it on
-                return list(outcomes.values())
-            observation, reward, terminated, truncated, info = environment.last()
-            ended = bool(terminated or truncated)
-            if agent in self._agents:
-                outcomes[agent] = Outcome(agent, observation, float(reward), bool(terminated), bool(truncated), info)
-                if not ended:
-                    self._turn = agent
-                    return list(outcomes.values())
-            environment.step(None if ended else self._others(agent, observation, info))
-        raise _idle()
-
-
-def _idle() -> EnvironmentSetupError:
-    return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
-
-
-class _SimultaneousGame:
-    """A game whose agents act together (PettingZoo's parallel interface)."""
-
-    def __init__(self, environment: Any, agents: Sequence[str], others: Callable[[str, Any, Any], Any]) -> None:
-        self._environment, self._agents, self._others = environment, frozenset(agents), others
-        self._seen: dict[str, tuple[Any, Any]] = {}  # newest observation and info of the agents that are not ours
-
-    def reset(self, seed: int | None) -> list[Outcome]:
-        """See _Game."""
-        observations, infos = self._environment.reset(seed=seed)
-        outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
-        return outcomes or self.step({})
-
-    def step(self, actions: dict[str, Any]) -> list[Outcome]:
-        """See _Game."""
-        for _ in range(_MOST_IDLE_TURNS):
-            outcomes = self._step_once(actions)
-            if outcomes or self.is_over:
-                return outcomes
-        raise _idle()
-
-    def _step_once(self, actions: dict[str, Any]) -> list[Outcome]:
-        before = tuple(self._environment.agents)
-        chosen = {
-            agent: actions[agent] if agent in self._agents else self._others(agent, *self._seen[agent])
-            for agent in before
-        }
-        observations, rewards, terminated, truncated, infos = self._environment.step(chosen)
-        came = [agent for agent in self._environment.agents if agent not in before]
-        return self._outcomes((*before, *came), observations, rewards, terminated, truncated, infos)
-
-    @property
-    def is_over(self) -> bool:
-        """See _Game."""
-        return not self._environment.agents
-
-    def _outcomes(
-        self,
-        agents: Sequence[str],
-        observations: Mapping[str, Any],
-        rewards: Mapping[str, float],
-        terminated: Mapping[str, bool],
-        truncated: Mapping[str, bool],
-        infos: Mapping[str, Any],
-    ) -> list[Outcome]:
-        missing = [agent for agent in agents if agent not in observations]
-        if missing:
-            raise EnvironmentSetupError(
-                f"there is no observation of {missing[0]} after its action: return one of each agent that acted, "
-                "also of those that leave with this step"
-            )
-        self._seen = {
-            agent: (observations[agent], infos.get(agent, {})) for agent in agents if agent not in self._agents
-        }
-        return [
-            Outcome(
-                agent,
-                observations[agent],
-                float(rewards.get(agent, 0.0)),
-                bool(terminated.get(agent, False)),
-                bool(truncated.get(agent, False)),
-                infos.get(agent, {}),
-            )
-            for agent in agents
-            if agent in self._agents
-        ]
 
 
 class GameEnvironments:
@@ -191,7 +50,7 @@ class GameEnvironments:
           name: id of the game, for errors.
           copies: the environments, of one kind.
           spec: which components are left out, and whether the observation names the agent.
-          seats: the agents that the policy plays. The others take random legal actions.
+          seats: the agents that have seats. The others take random legal actions.
 
         Raises EnvironmentSetupError.
         """
@@ -199,21 +58,28 @@ class GameEnvironments:
         self.seats = len(seats)
         self.count = len(copies) * len(seats)
         self._numbers = {agent: number for number, agent in enumerate(seats)}
-        self._others = np.random.default_rng(0)
-        kinds = [_SimultaneousGame if _is_parallel(each) else _TurnGame for each in copies]
-        self._games: list[_Game] = [
-            kind(environment, seats, self._random_action) for kind, environment in zip(kinds, copies, strict=True)
+        self._random = [np.random.default_rng(number) for number in range(len(copies))]
+        self._others: dict[str, LegalActions] = {}  # of the agents without a seat
+        self._games = [
+            game_copy(environment, spec, seats, partial(self._random_action, number))
+            for number, environment in enumerate(copies)
         ]
+        self._bots: list[Bot | None] = [None] * self.count  # of the seats, from the next match on
+        self._in_match: list[Bot | None] = [None] * self.count
+        self._newest: list[tuple[Any, Any]] = [(None, None)] * self.count  # observation and mask of each bot's seat
         self._agent_ids = spec.agent_ids
         self._of_game: gymnasium.Space = copies[0].observation_space(seats[0])
         self.observation_space = _with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
         self.action_space: gymnasium.Space = copies[0].action_space(seats[0])
         read = without(self.observation_space, spec.leave_out)
-        self._leaves = [leaf for leaf in leaves(read, "observation") if leaf.space.shape is not None]
         self.observations: Any = create_empty_array(self.observation_space, self.count)
+        self._leaves = [  # each with its array of the observations of all seats
+            (leaf, leaf.of(self.observations)) for leaf in leaves(read, "observation") if leaf.space.shape is not None
+        ]
         self._ended = np.zeros(self.count, np.bool_)
         self._acts = np.zeros(self.count, np.bool_)  # whether the seat has acted in this match
         self._warned = False
+        self.resting = np.zeros(len(copies), np.bool_)  # copies that do not begin another match
         self._episode_info = EpisodeInfo()
         self.acting = np.zeros(self.count, np.bool_)
         self.action_mask: Any = None
@@ -225,14 +91,33 @@ class GameEnvironments:
         """Whether the match of each copy has ended, [copies] bool."""
         return np.array([game.is_over for game in self._games])
 
+    def is_over(self, copy: int) -> bool:
+        """Return whether the match of a copy has ended."""
+        return self._games[copy].is_over
+
+    def seat_bot(self, seat: int, bot: Bot | None) -> None:
+        """Let a bot choose the actions of a seat from the next match of its copy on; None: the caller chooses them.
+
+        A bot's seat is `acting` as others are, and what the caller chooses for it has no effect. A bot plays one seat.
+        """
+        self._bots[seat] = bot
+
     def reset(self, seed: int) -> Any:
         """See BackendEnvironments."""
-        self._others = np.random.default_rng(seed)
         self.acting = np.zeros(self.count, np.bool_)
         self._ended[:] = self._acts[:] = False
         for number in range(len(self._games)):
+            self._random[number] = np.random.default_rng(seed + number)
+            self._begin_match(number)
             self._note(number, self._call("reset", number, seed + number))
         return self.observations
+
+    def _begin_match(self, number: int) -> None:
+        for agent, place in self._numbers.items():
+            seat = number * self.seats + place
+            bot = self._in_match[seat] = self._bots[seat]
+            if bot is not None:
+                bot.reset(agent, int(self._random[number].integers(2**31)))
 
     def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments. The actions of seats that were not acting have no effect."""
@@ -242,20 +127,26 @@ class GameEnvironments:
         self._acts |= acted & ~self._ended
         for number, game in enumerate(self._games):
             if game.is_over:
+                if self.resting[number]:
+                    continue
+                self._begin_match(number)
                 outcomes = self._call("reset", number, None)
                 if not outcomes:
                     raise EnvironmentSetupError(f"environment {self.name}: no agent can act after reset")
             else:
                 first = number * self.seats
-                chosen = {
-                    agent: _only(self.action_space, actions, first + seat) for agent, seat in self._numbers.items()
-                }
+                chosen = {agent: self._chosen(actions, first + self._numbers[agent]) for agent in game.turns}
                 outcomes = self._call("step", number, chosen)
             for outcome in self._note(number, outcomes):
                 seat = number * self.seats + self._numbers[outcome.agent]
                 rewards[seat] = outcome.reward
                 terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
         return self.observations, rewards, terminated, truncated
+
+    def _chosen(self, actions: Any, seat: int) -> Any:
+        """Return the action of a seat that must act: its bot's, or the caller's."""
+        bot = self._in_match[seat]
+        return _only(self.action_space, actions, seat) if bot is None else bot.act(*self._newest[seat])
 
     def _call(self, call: str, number: int, argument: Any) -> list[Outcome]:
         try:
@@ -274,16 +165,17 @@ class GameEnvironments:
             seat = number * self.seats + self._numbers[outcome.agent]
             self._write(seat, outcome)
             self.acting[seat] = True
+            if self._in_match[seat] is not None:
+                self._newest[seat] = outcome.observation, _mask(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:
                 self._warn_of_reward(outcome)
                 outcome = outcome._replace(reward=0.0)
             self._ended[seat] = outcome.terminated or outcome.truncated
             if self._ended[seat]:
                 self._acts[seat] = False
-                scalars = {
-                    name: np.array([value]) for name, value in info_to_keep(dict(outcome.info), ended=True).items()
-                }
-                self._episode_info.add(scalars, np.array([True]))
+                if outcome.info:
+                    kept = info_to_keep(dict(outcome.info), ended=True)
+                    self._episode_info.add({name: np.array([kept[name]]) for name in kept}, np.array([True]))
             noted.append(outcome)
         return noted
 
@@ -292,17 +184,17 @@ class GameEnvironments:
         if self._agent_ids:
             parts = observation if isinstance(observation, Mapping) else {"observation": observation}
             observation = {**parts, _AGENT: self._numbers[outcome.agent]}
-        for leaf in self._leaves:
+        for leaf, written in self._leaves:
             try:
                 value = leaf.of(observation)
             except (KeyError, IndexError, TypeError, ValueError):
                 value = None
-            if value is None or value.shape != leaf.space.shape or (dtype_misfit(leaf.space, value)):
+            if value is None or value.shape != written.shape[1:] or dtype_misfit(leaf.space, value):
                 raise EnvironmentSetupError(
                     f"environment {self.name}: {outcome.agent} observes {described(observation)}, which is not of its "
                     f"space {described(self._of_game)}"
                 )
-            leaf.of(self.observations)[seat] = value
+            written[seat] = value
         self._write_mask(seat, outcome)
 
     def _write_mask(self, seat: int, outcome: Outcome) -> None:
@@ -343,16 +235,25 @@ class GameEnvironments:
                 outcome.reward,
             )
 
-    def _random_action(self, agent: str, observation: Any, info: Any) -> Any:
-        """Return a legal action of an agent that the policy does not play."""
-        space = self._environments[0].action_space(agent)
-        mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
-        if mask is None and isinstance(info, Mapping):
-            mask = info.get(MASK_KEY)
-        if mask is not None and isinstance(space, gymnasium.spaces.Discrete):
-            return int(space.start) + int(self._others.choice(np.flatnonzero(mask)))
-        space.seed(int(self._others.integers(2**31)))
-        return space.sample()
+    def _random_action(self, number: int, agent: str, observation: Any, info: Any) -> Any:
+        """Return a legal action of an agent without a seat."""
+        if agent not in self._others:
+            self._others[agent] = LegalActions(self._environments[0].action_space(agent))
+        return self._others[agent].sample(_mask(observation, info), self._random[number])
+
+    def render(self) -> str | np.ndarray | None:
+        """Return the first copy as a text or an image [H, W, 3] uint8; None if the games were not made to be shown."""
+        environment = self._environments[0]
+        if getattr(environment, "render_mode", None) not in _SHOWN:
+            return None
+        try:
+            with USER_STATE:
+                shown = environment.render()
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise playing_error(self.name, "render", error) from error
+        if isinstance(shown, str) or (isinstance(shown, np.ndarray) and shown.ndim == 3):
+            return shown
+        return None
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""
@@ -371,13 +272,32 @@ class GameEnvironments:
             raise EnvironmentSetupError(f"environment {self.name}: close raises {first_line(errors[0])}") from errors[0]
 
 
-def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameEnvironments:
-    """Return `count` copies of the game that a specification names. Raises EnvironmentSetupError."""
+def _mask(observation: Any, info: Any) -> Any:
+    """Return the mask of legal actions that a game gives with an observation, or None."""
+    mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
+    return info.get(MASK_KEY) if mask is None and isinstance(info, Mapping) else mask
+
+
+def make_games(
+    spec: EnvironmentSpec,
+    count: int,
+    modules: UserModules,
+    further: Callable[[tuple[str, ...]], int] = lambda _: 0,
+    *,
+    shown: bool = False,
+) -> GameEnvironments:
+    """Return `count` copies of the game that a specification names, and further ones, as its seats demand.
+
+    `shown`: they render texts or images, if they can. Raises EnvironmentSetupError, and what `further` raises.
+    """
     copies: list[Any] = []
     try:
-        for made in range(count):
-            with creation_errors(spec.id, hint_of_count(made, count)):
-                copies.append(_make(spec, modules))
+        while len(copies) < count:
+            with creation_errors(spec.id, hint_of_count(len(copies), count)):
+                copies.append(_make_shown(spec, modules) if shown else _make(spec, modules))
+            if len(copies) == 1:
+                seats = _seats(copies[0], spec)
+                count += further(seats)
         return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
     except BaseException:
         for each in copies:
@@ -385,7 +305,24 @@ def make_games(spec: EnvironmentSpec, count: int, modules: UserModules) -> GameE
         raise
 
 
-def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
+def _make_shown(spec: EnvironmentSpec, modules: UserModules) -> Any:
+    """Return a game that renders itself as a text or an image if it can: it says so in its metadata."""
+    render_without_display()
+    environment = _make(spec, modules)
+    modes = getattr(environment, "metadata", {}).get("render_modes", ())
+    mode = next((mode for mode in _SHOWN if mode in modes), None)
+    if mode is None or "render_mode" in spec.constructor_kwargs:
+        return environment
+    try:
+        rendered = _make(spec, modules, render_mode=mode)
+    except (Exception, SystemExit) as error:  # of the user's code: its function need not have this argument
+        _logger.warning("environment %s cannot be made with render_mode=%r: %s", spec.id, mode, first_line(error))
+        return environment
+    environment.close()
+    return rendered
+
+
+def _make(spec: EnvironmentSpec, modules: UserModules, **options: Any) -> Any:
     module_name, colon, function = spec.id.partition(":")
     if colon:
         try:
@@ -398,7 +335,7 @@ def _make(spec: EnvironmentSpec, modules: UserModules) -> Any:
         function = "env"
     if not callable(make):
         raise EnvironmentSetupError(f"environment {spec.id}: there is no function {function}() that makes the game")
-    environment = make(**spec.constructor_kwargs)
+    environment = make(**{**spec.constructor_kwargs, **options})
     if not hasattr(environment, "possible_agents"):
         raise EnvironmentSetupError(
             f"environment {spec.id} made {type(environment).__name__}, which has no possible_agents: "
@@ -422,10 +359,6 @@ def _module(name: str) -> Any:
         if error.name is not None and name.startswith(error.name):
             raise EnvironmentSetupError(f"unknown game {name!r}: {first_line(error)}") from None
         raise
-
-
-def _is_parallel(environment: Any) -> bool:
-    return not hasattr(environment, "agent_iter")
 
 
 def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:

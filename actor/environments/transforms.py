@@ -161,6 +161,11 @@ class TransformedEnvironment:
         return self._transforms.spaces
 
     @property
+    def games(self) -> GameEnvironments | None:
+        """See VectorEnvironment."""
+        return self._games
+
+    @property
     def seats(self) -> int:
         """See VectorEnvironment."""
         return self._games.seats if self._games is not None else 1

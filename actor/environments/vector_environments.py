@@ -4,12 +4,15 @@ The step after an episode's end ignores its action and resets. Observations are 
 stacks them. Rewards are the environment's own.
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
 
 from daedalus.protocol.spaces import Spaces
+
+if TYPE_CHECKING:
+    from daedalus.actor.environments.games import GameEnvironments
 
 
 class Observed(NamedTuple):
@@ -36,6 +39,11 @@ class VectorEnvironment(Protocol):
     @property
     def spaces(self) -> Spaces:
         """The observation and action space of one environment, as the run has them."""
+        ...
+
+    @property
+    def games(self) -> "GameEnvironments | None":
+        """The games whose seats these environments are; None for environments with one agent."""
         ...
 
     @property

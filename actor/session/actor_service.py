@@ -14,12 +14,13 @@ from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.actor.session.conversation import RunOverError
+from daedalus.actor.session.league_feed import Oppose
 from daedalus.actor.session.session_engine import ActorSession, Begin, Collect, Encode, Load, Prepare
 from daedalus.actor.session.session_thread import SessionThread
 from daedalus.actor.session.uploading import RolloutUploadMaker, UploadMaker, make_upload_maker
-from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError, PolicyRuntime
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import ClientReport, Welcome
+from daedalus.protocol.messages import ClientReport, Snapshot, Welcome
 from daedalus.protocol.spec import UnsupportedRunError
 from daedalus.transport.interface import Transport
 from daedalus.transport.process_usage import UsageMeter
@@ -54,6 +55,8 @@ class ActorService:
         self._session = ActorSession(config, own_origin(transport), report)
         self._session.reports.usage = UsageMeter().measure
         self._thread = SessionThread(self._session, transport, stop)
+        self._own_runtime: PolicyRuntime | None = None
+        self._begin: Begin | None = None  # the newest
         self._upload_maker: UploadMaker = RolloutUploadMaker()  # what is uploaded of the rollouts
 
     def run(self) -> bool:
@@ -98,13 +101,47 @@ class ActorService:
                 self._collector.confirm(confirmed_at)
             case Prepare(welcome):
                 self._on_join(welcome)
-                return self._collector.prepare(welcome.spec)
+                prepared = self._collector.prepare(welcome.spec)
+                self._session.has_opponents = (
+                    self._collector.lineup is not None and self._collector.lineup.has_opponents
+                )
+                return prepared
+            case Oppose():
+                return self._oppose(action)
             case Begin(welcome):
+                self._own_runtime, self._begin = self._runtime(action), action
                 self._collector.begin(
-                    self._runtime(action), welcome.spec, welcome.entropy(self._config.name), welcome.epsilon
+                    self._own_runtime, welcome.spec, welcome.entropy(self._config.name), welcome.epsilon
                 )
                 self._upload_maker = make_upload_maker(welcome.spec, action.spaces, self._config.modules)
         return None
+
+    def _oppose(self, news: Oppose) -> str:
+        """Take a plan or a policy for the games, and return which player's policy is wanted."""
+        lineup = self._collector.lineup
+        assert lineup is not None
+        if news.plan is not None:
+            lineup.plan = news.plan
+        if news.snapshot is None:
+            lineup.give_up(news.player)
+            return lineup.wanted
+        try:
+            lineup.add_policy(news.player, self._opponent_runtime(news.snapshot, news.program))
+        except PolicyError as error:  # of the opponent: the run's own policy plays on
+            _logger.warning("opponent %s does not play: %s", news.player, error)
+            lineup.give_up(news.player)
+        return lineup.wanted
+
+    def _opponent_runtime(self, snapshot: Snapshot, program: bytes | None) -> PolicyRuntime:
+        assert self._begin is not None
+        if program is not None:
+            runtime: PolicyRuntime = OnnxRuntime(program, self._stop)
+        elif isinstance(self._own_runtime, OnnxRuntime):
+            runtime = self._own_runtime.fork()
+        else:
+            runtime = self._runtime(self._begin)
+        runtime.load(snapshot.weights)
+        return runtime
 
     def _on_row(self) -> None:
         if self._session.begin_row(time.monotonic()):

@@ -12,6 +12,7 @@ from typing import Never
 from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.conversation import LEAVES, Conversation, RunOverError, Steps, Wait, WatchPresence
+from daedalus.actor.session.league_feed import LeagueFeed
 from daedalus.actor.session.snapshots import FetchSchedule, SnapshotFeed
 from daedalus.actor.session.uploading import ACTOR_PAUSE_SECONDS, CLIENT_PAUSE_SECONDS, Pace, Reports, Uploads
 from daedalus.protocol import keys
@@ -164,7 +165,7 @@ class ActorSession(PolicySession):
     Attributes:
       rollout_ready: set this when a client has filled a rollout.
       sequence: number of the next rollout in this learner epoch.
-      rows: rows of the present rollout that have begun. Whoever performs `Collect` counts them.
+      has_opponents: whether opponents may play in its games. Whoever performs `Prepare` sets it.
     """
 
     def __init__(
@@ -187,6 +188,7 @@ class ActorSession(PolicySession):
         self._loaded_version = -1  # the policy version that the actor plays
         self._confirm_at = 0.0  # not before this time, a confirmation of the policy is requested
         self._slow_rollouts = 0  # in a row
+        self.has_opponents, self._league = False, LeagueFeed(self)
         self._warned_of_rejections = False
 
     def play(self) -> Steps[Never]:
@@ -264,6 +266,7 @@ class ActorSession(PolicySession):
         self._loaded_version = -1
         spaces, count = yield Prepare(welcome)
         self.feed.begin()
+        self._league.begin()
         self.act(WatchPresence(keys.learner(welcome.run)))
         self.reports.begin()
         welcome = yield from self.confirm(welcome, replace(self.join, spaces=spaces, environments=count))
@@ -301,6 +304,9 @@ class ActorSession(PolicySession):
             if not synchronous:
                 yield from self._await_fetch(self.now - began_waiting)
             yield self._load()
+            if self.has_opponents:
+                assert self.feed.newest is not None
+                yield from self._league.follow(self.feed.newest.program)
             began = self.now
             if self.leave_by is not None:
                 yield from self.wait(lambda: False)  # until `check_leave` raises

@@ -271,7 +271,7 @@ def test_cartpole_vector_entry_point_resets_after_truncations_too() -> None:
 class Seeds(PlainPolicy):
     """Environments that keep the seed of their reset, and a policy that keeps its noise."""
 
-    count = seats = 1
+    count, seats, games = 1, 1, None
     spaces = vector_spaces(2, 4)
 
     def __init__(self) -> None:

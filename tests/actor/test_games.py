@@ -11,6 +11,10 @@ from gymnasium.spaces import Box, Discrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
+from pettingzoo.butterfly.knights_archers_zombies import knights_archers_zombies
+from pettingzoo.classic.tictactoe import tictactoe
+from pettingzoo.utils.conversions import aec_to_parallel_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from plain import PlainPolicy
 
 from daedalus.actor.checking.check_report import EnvironmentReport
@@ -24,8 +28,9 @@ from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.league import MatchCount, Plan, PlannedOpponent, PlannedRating
 from daedalus.protocol.spaces import DiscreteSpace
-from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
+from daedalus.protocol.spec import EnvironmentSpec, LeagueSpec, PolicySpec, TrainingSpec
 
 ROLLOUTS = 6
 
@@ -50,39 +55,53 @@ class Counting(PlainPolicy):
     copies=st.integers(1, 3),
     length=st.integers(1, 7),
     kind=st.sampled_from(["Turns", "Together"]),
+    share=st.sampled_from([0.0, 0.4, 1.0]),
 )
 def test_rows_of_each_seat_are_those_of_a_slow_account(
-    seed: int, agents: int, copies: int, length: int, kind: str
+    seed: int, agents: int, copies: int, length: int, kind: str, share: float
 ) -> None:
     spec = EnvironmentSpec(id=f"scripted_games:{kind}", backend="pettingzoo", kwargs={"seed": seed, "agents": agents})
     scripted_games.PLAYED.clear()
-    first_copy = scripted_games.Scripted.made
-    collector = started_collector(spec, Counting(), count=copies, rollout_length=length)
-    together = kind == "Together"
+    first_copy, together = scripted_games.Scripted.made, kind == "Together"
+    side = agents // 2 if agents in (2, 4) else agents
+    names = [f"agent_{number}" for number in range(agents)]
+    sides = (tuple(names[:side]), tuple(names[side:])) if side < agents else ()
+    league = LeagueSpec(past_share=0.0, opponents={"random": share}, rating_share=0.2, sides=sides)
+    collector = started_collector(spec, Counting(), count=copies, rollout_length=length, league=league)
+    alone = copies - (round(share * copies) if sides else 0)  # the others play against an opponent
     accounts: dict[int, dict] = {}
-    last: dict[int, tuple[int, ...]] = {}
+    seen, members, results = set(), dict[tuple[int, int], set[int]](), list[MatchCount]()
+    last: dict[int, tuple[int, int]] = {}
     try:
         for _ in range(ROLLOUTS):
             rollout = collect(collector)
+            assert rollout.environments == alone * agents + (copies - alone) * side
             frames, steps = rollout.frames["observation"], set()
-            for column in range(copies * agents):
+            for column in range(rollout.environments):
+                copy = column // agents if column < alone * agents else alone + (column - alone * agents) // side
                 for row in np.flatnonzero(rollout.valid[:, column]):
                     match, agent, number = (int(number) for number in frames[row, column])
-                    key = (match, agent, number)
-                    assert agent == column % agents
-                    assert key > last.get(column, (-1, -1, -1))[:3]  # in order, and none twice
-                    last[column] = key
+                    key = match, agent, number
+                    assert (match, number) > last.get(column, (-1, -1))  # in order
+                    last[column] = match, number
+                    assert (copy, key) not in seen  # none twice
+                    seen.add((copy, key))
+                    members.setdefault((copy, match), set()).add(agent)
+                    if row and rollout.valid[row - 1, column]:
+                        assert tuple(frames[row - 1, column]) == (match, agent, number - 1)
+                    elif row:
+                        assert number == 0  # after a row that only resets
                     if match not in accounts:
                         accounts[match] = scripted_games.rows(seed, match, agents, together=together)
                     wanted = accounts[match][key]
                     assert rollout.rewards[row, column] == wanted.reward
                     assert rollout.terminated[row, column] == wanted.terminated
                     assert rollout.truncated[row, column] == wanted.truncated
-                    assert tuple(frames[row + 1, column]) == (match, agent, key[2] + 1)
-                    assert rollout.behaviour_log_probs[row, column] == key[2]
-                    copy = first_copy + column // agents
-                    assert rollout.actions["action"][row, column, 0] == scripted_games.PLAYED[copy, key]
-                    steps.add((column // agents, match, wanted.step))
+                    if not (wanted.terminated or wanted.truncated):
+                        assert tuple(frames[row + 1, column]) == (match, agent, number + 1)
+                    assert rollout.behaviour_log_probs[row, column] == number
+                    assert rollout.actions["action"][row, column, 0] == scripted_games.PLAYED[first_copy + copy, key]
+                    steps.add((copy, match, wanted.step))
                 if rollout.valid[0, column]:  # the memory goes on in an episode, and begins anew in the next
                     assert rollout.initial_state[column, 0] == frames[0, column, 2]
             assert rollout.agent_steps == np.count_nonzero(rollout.valid)
@@ -95,10 +114,131 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
                 for agent in range(agents)
                 if (played := [row for key, row in account.items() if key[1] == agent])
             }
-            results = zip(rollout.episode_returns.tolist(), rollout.episode_lengths.tolist(), strict=True)
-            assert set(results) <= episodes
+            found = zip(rollout.episode_returns.tolist(), rollout.episode_lengths.tolist(), strict=True)
+            assert set(found) <= episodes
+            results += rollout.matches.counts if rollout.matches is not None else ()
     finally:
         collector.close()
+    for (copy, _), playing in members.items():
+        if copy >= alone:  # one side only
+            assert len({agent // side for agent in playing}) == 1
+    check_results(results, accounts, [first_copy + copy for copy in range(alone, copies)], side)
+
+
+def check_results(
+    results: list[MatchCount],
+    accounts: dict[int, dict[scripted_games.Key, scripted_games.Row]],
+    games: list[int],
+    side: int,
+) -> None:
+    """Check the results against newest-against-random matches of some games, whoever had which side."""
+    assert {(each.purpose, each.first, each.second) for each in results} <= {("training", "newest", "random")}
+    most = np.zeros((2, 3))
+    finished = 0
+    for game in games:
+        played = {key[0] for number, key in scripted_games.PLAYED if number == game}
+        finished += len(played)
+        for match in played:
+            means = np.zeros(2)
+            for key, row in accounts[match].items():
+                means[key[1] // side] += row.reward
+            for own in range(2):
+                most[own, 1 - int(np.sign(means[own] - means[1 - own]))] += 1
+    counted = np.zeros((2, 3))
+    for each in results:
+        counted[each.side] += each.wins, each.draws, each.losses
+    assert (counted <= most).all()
+    assert finished - len(games) <= counted.sum() <= finished  # the newest match of a game may go on
+
+
+class Always(PlainPolicy):
+    """A policy that always takes the same action."""
+
+    def __init__(self, action: int) -> None:
+        super().__init__()
+        self._action = action
+
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See PlainPolicy."""
+        count = len(observations)
+        return np.full(count, self._action), np.zeros(count, np.float32), state
+
+
+def test_policies_of_opponents_play_their_seats_alone_and_lose() -> None:
+    """Each action earns itself: the newest policy always wins with 1 against 0, and its rows have no action 0."""
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": "free"})
+    league = LeagueSpec(past_share=0.5, rating_share=0.5)
+    modules = UserModules(frozenset({"test_games"}))
+    collector = started_collector(spec, Always(1), count=4, rollout_length=10, league=league, modules=modules)
+    lineup = collector.lineup
+    assert lineup is not None
+    counts: dict[tuple[str, str, str], np.ndarray] = {}
+    for number in range(12):
+        if number == 1:
+            lineup.plan = Plan(
+                training=(PlannedOpponent(player="v1", weight=0.5),),
+                rating=(PlannedRating(first="v1", second="v2", weight=1.0),),
+            )
+        if lineup.wanted and number > 1:
+            lineup.add_policy(lineup.wanted, Always(0))
+        rollout = collect(collector)
+        assert rollout.environments == 2 * 2 + 2
+        assert (rollout.actions["action"][rollout.valid] == 1).all()
+        assert set(rollout.episode_returns.tolist()) <= {5.0}
+        for each in rollout.matches.counts if rollout.matches is not None else ():
+            key = each.purpose, each.first, each.second
+            counts[key] = counts.get(key, np.zeros(3)) + np.array([each.wins, each.draws, each.losses])
+    collector.close()
+    assert set(counts) == {("training", "newest", "v1"), ("rating", "v1", "v2")}
+    wins, *others = counts["training", "newest", "v1"]
+    assert wins > 10
+    assert others == [0, 0]
+    rated = counts["rating", "v1", "v2"]
+    assert rated[1] > 5
+    assert rated.sum() == rated[1]
+
+
+class KeptChecks(OrderEnforcingWrapper):
+    """A wrapper that the backend does not know, with those of PettingZoo in it."""
+
+
+class KeptConversion(aec_to_parallel_wrapper):
+    """A conversion that the backend does not know."""
+
+
+def tic_tac_toe(*, kept: bool) -> Any:
+    return KeptChecks(tictactoe.env()) if kept else tictactoe.env()
+
+
+def zombies(*, kept: bool) -> Any:
+    game = knights_archers_zombies.env(spawn_delay=5, max_cycles=60)  # agents die early
+    return KeptConversion(game) if kept else aec_to_parallel_wrapper(game)
+
+
+@pytest.mark.parametrize("fields", [{}, {"leave_out": ("action_mask",)}, {"id": "test_games:zombies"}])
+def test_games_are_the_same_without_pettingzoo_s_checks(fields: dict[str, Any]) -> None:
+    tapes = []
+    for kept in (False, True):
+        spec = EnvironmentSpec(
+            **{"id": "test_games:tic_tac_toe", "backend": "pettingzoo", "kwargs": {"kept": kept}, **fields}
+        )
+        environments = make_environments(spec, 2, modules=UserModules(frozenset({"test_games"})))
+        random = np.random.default_rng(4)
+        observed, tape = environments.reset(2), []
+        for _ in range(80):
+            legal = observed.masks.get("action", np.ones((environments.count, 6)))
+            if "leave_out" in fields:
+                legal = np.ones((environments.count, 9))  # the wrapper ends the match at an illegal action
+            actions = np.argmax(legal * random.random(legal.shape), axis=1)[:, None]
+            observed, *outcome = environments.step({"action": actions})
+            tape.append((*(values.copy() for values in observed.frames.values()), observed.acting, *outcome))
+        environments.close()
+        tapes.append(tape)
+    for one, other in zip(*tapes, strict=True):
+        for values, same in zip(one, other, strict=True):
+            np.testing.assert_array_equal(values, same)
 
 
 def make(problem: str = "", **fields: Any) -> EnvironmentReport:
@@ -139,6 +279,8 @@ class Duel(ParallelEnv):
         return {agent: np.full(self.observation_space(agent).shape[0] + more, 0.5, np.float32) for agent in agents}
 
     def _info(self) -> dict[str, dict]:
+        if self.problem == "free":
+            return {agent: {} for agent in self.possible_agents}
         mask = np.array([0, 0 if self.problem == "no choice" and self.left < 5 else 1], np.int8)
         return {agent: {"action_mask": mask} for agent in self.possible_agents}
 

@@ -1,0 +1,256 @@
+"""One copy of a game, stepped until agents of the policy must act, whichever of PettingZoo's two interfaces it has."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.info import MASK_KEY
+from daedalus.protocol.spec import EnvironmentSpec
+
+_MOST_IDLE_TURNS = 100_000  # of agents without a seat, between two turns of the seats
+
+OtherAction = Callable[[str, Any, Any], Any]  # of an agent without a seat, for its observation and info
+
+
+class Outcome(NamedTuple):
+    """What is new for one agent: an observation to act on, or the last one of its episode."""
+
+    agent: str
+    observation: Any
+    reward: float  # since its last action
+    terminated: bool
+    truncated: bool
+    info: Mapping[str, Any]
+
+
+class GameCopy(Protocol):
+    """One copy of a game."""
+
+    def reset(self, seed: int | None) -> list[Outcome]:
+        """Begin a match, and return what is new for its first agents."""
+        ...
+
+    @property
+    def turns(self) -> Sequence[str]:
+        """The agents with a seat that must act next."""
+        ...
+
+    def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
+        """Play on with the actions of the agents that must act, until an agent with a seat has something new."""
+        ...
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the match has ended for all agents."""
+        ...
+
+
+def game_copy(environment: Any, spec: EnvironmentSpec, seats: Sequence[str], others: OtherAction) -> GameCopy:
+    """Return a copy of a game as one of these, without the wrappers that it does not need."""
+    if not hasattr(environment, "agent_iter"):
+        return _SimultaneousGame(_in_rounds(environment, spec), seats, others)
+    return _TurnGame(_without_checks(environment, spec), seats, others)
+
+
+def _without_checks(environment: Any, spec: EnvironmentSpec) -> Any:
+    """Return an AEC environment without PettingZoo's outer wrappers that only check or correct what its caller does.
+
+    They take most of the time of a small game. Here calls are always in order, and actions always in their space and
+    legal by the mask: the wrappers would change nothing.
+    """
+    try:
+        from pettingzoo.utils import wrappers
+    except ImportError:  # an environment with the same interface, of somebody who does without it
+        return environment
+    agent = environment.possible_agents[0]
+    spaces = environment.observation_space(agent), environment.action_space(agent)
+    checks: tuple[type, ...] = (
+        wrappers.OrderEnforcingWrapper,
+        wrappers.AssertOutOfBoundsWrapper,
+        wrappers.ClipOutOfBoundsWrapper,
+    )
+    masked = isinstance(spaces[0], gymnasium.spaces.Dict) and MASK_KEY in spaces[0].spaces
+    if masked and MASK_KEY not in spec.leave_out and isinstance(spaces[1], gymnasium.spaces.Discrete):
+        checks = (*checks, wrappers.TerminateIllegalWrapper)
+    while type(environment) in checks:
+        environment = environment.env
+    return environment
+
+
+class _TurnGame:
+    """A game whose agents act one after the other (PettingZoo's AEC interface)."""
+
+    def __init__(self, environment: Any, agents: Sequence[str], others: OtherAction) -> None:
+        self._environment, self._agents, self._others = environment, frozenset(agents), others
+        self._turn: str | None = None  # the agent of ours that must act
+
+    def reset(self, seed: int | None) -> list[Outcome]:
+        """See GameCopy."""
+        self._environment.reset(seed=seed)
+        self._turn = None
+        return self._advance()
+
+    @property
+    def turns(self) -> Sequence[str]:
+        """See GameCopy."""
+        return () if self._turn is None else (self._turn,)
+
+    def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
+        """See GameCopy."""
+        if self._turn is not None:
+            action, self._turn = actions[self._turn], None
+            self._environment.step(action)
+        return self._advance()
+
+    @property
+    def is_over(self) -> bool:
+        """See GameCopy."""
+        return not self._environment.agents
+
+    def _advance(self) -> list[Outcome]:
+        """Return what is new up to the next turn of an agent of ours, at most once for each agent."""
+        environment, outcomes = self._environment, dict[str, Outcome]()
+        for _ in range(_MOST_IDLE_TURNS):
+            if not environment.agents:
+                return list(outcomes.values())
+            agent = environment.agent_selection
+            if agent in outcomes:  # the next call passes it on
+                return list(outcomes.values())
+            observation, reward, terminated, truncated, info = environment.last()
+            ended = bool(terminated or truncated)
+            if agent in self._agents:
+                outcomes[agent] = Outcome(agent, observation, float(reward), bool(terminated), bool(truncated), info)
+                if not ended:
+                    self._turn = agent
+                    return list(outcomes.values())
+            environment.step(None if ended else self._others(agent, observation, info))
+        raise _idle()
+
+
+def _idle() -> EnvironmentSetupError:
+    return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
+
+
+class _SimultaneousGame:
+    """A game whose agents act together (PettingZoo's parallel interface)."""
+
+    def __init__(self, environment: Any, agents: Sequence[str], others: OtherAction) -> None:
+        self._environment, self._agents, self._others = environment, frozenset(agents), others
+        self._seen: dict[str, tuple[Any, Any]] = {}  # newest observation and info of the agents that are not ours
+
+    def reset(self, seed: int | None) -> list[Outcome]:
+        """See GameCopy."""
+        observations, infos = self._environment.reset(seed=seed)
+        outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
+        return outcomes or self.step({})
+
+    @property
+    def turns(self) -> Sequence[str]:
+        """See GameCopy."""
+        return [agent for agent in self._environment.agents if agent in self._agents]
+
+    def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
+        """See GameCopy."""
+        for _ in range(_MOST_IDLE_TURNS):
+            outcomes = self._step_once(actions)
+            if outcomes or self.is_over:
+                return outcomes
+        raise _idle()
+
+    def _step_once(self, actions: Mapping[str, Any]) -> list[Outcome]:
+        before = tuple(self._environment.agents)
+        chosen = {
+            agent: actions[agent] if agent in self._agents else self._others(agent, *self._seen[agent])
+            for agent in before
+        }
+        observations, rewards, terminated, truncated, infos = self._environment.step(chosen)
+        came = [agent for agent in self._environment.agents if agent not in before]
+        return self._outcomes((*before, *came), observations, rewards, terminated, truncated, infos)
+
+    @property
+    def is_over(self) -> bool:
+        """See GameCopy."""
+        return not self._environment.agents
+
+    def _outcomes(
+        self,
+        agents: Sequence[str],
+        observations: Mapping[str, Any],
+        rewards: Mapping[str, float],
+        terminated: Mapping[str, bool],
+        truncated: Mapping[str, bool],
+        infos: Mapping[str, Any],
+    ) -> list[Outcome]:
+        missing = [agent for agent in agents if agent not in observations]
+        if missing:
+            raise EnvironmentSetupError(
+                f"there is no observation of {missing[0]} after its action: return one of each agent that acted, "
+                "also of those that leave with this step"
+            )
+        self._seen = {
+            agent: (observations[agent], infos.get(agent, {})) for agent in agents if agent not in self._agents
+        }
+        return [
+            Outcome(
+                agent,
+                observations[agent],
+                float(rewards.get(agent, 0.0)),
+                bool(terminated.get(agent, False)),
+                bool(truncated.get(agent, False)),
+                infos.get(agent, {}),
+            )
+            for agent in agents
+            if agent in self._agents
+        ]
+
+
+def _in_rounds(environment: Any, spec: EnvironmentSpec) -> Any:
+    """Return a parallel environment; in place of PettingZoo's conversion of an AEC environment _Rounds."""
+    try:
+        from pettingzoo.utils.conversions import aec_to_parallel_wrapper
+    except ImportError:  # see _without_checks
+        return environment
+    if type(environment) is not aec_to_parallel_wrapper:
+        return environment
+    environment.aec_env = _without_checks(environment.aec_env, spec)
+    return _Rounds(environment)
+
+
+class _Rounds:
+    """A parallel environment made of an AEC environment whose agents take turns in rounds.
+
+    It does what PettingZoo's conversion does, without its observations between the turns, which nobody reads: the
+    pictures of most games take longer than their steps.
+    """
+
+    def __init__(self, conversion: Any) -> None:
+        self._conversion, self._game = conversion, conversion.aec_env
+
+    @property
+    def agents(self) -> list[str]:
+        """The agents that must act."""
+        return self._game.agents
+
+    def reset(self, seed: int | None) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        """See pettingzoo.ParallelEnv."""
+        return self._conversion.reset(seed=seed)
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+        """See pettingzoo.ParallelEnv."""
+        game, rewards = self._game, dict[str, float]()
+        for agent in game.agents:
+            if agent != game.agent_selection:
+                raise EnvironmentSetupError(
+                    f"it is the turn of {game.agent_selection} in place of {agent}: agents that act together must have "
+                    "turns in the order of `agents`, and leave at the end of a round"
+                )
+            game.step(actions[agent])
+            for each in game.agents:
+                rewards[each] = rewards.get(each, 0.0) + game.rewards[each]
+        terminated, truncated, infos = dict(game.terminations), dict(game.truncations), dict(game.infos)
+        observations = {agent: game.observe(agent) for agent in game.agents}
+        while game.agents and (game.terminations[game.agent_selection] or game.truncations[game.agent_selection]):
+            game.step(None)
+        return observations, rewards, terminated, truncated, infos
