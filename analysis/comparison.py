@@ -215,7 +215,7 @@ def notes(comparison: Comparison) -> list[str]:
         )
     if comparison.rated:
         lines.append(
-            "games with opponents: what one side wins, the other loses, so that the returns of self-play say nothing about "
+            "games with opponents: what one side wins, the other loses, so that returns of self-play say nothing about "
             "the strength of play; let the policies play: daedalus evaluate RUN --against RUN2"
         )
     if comparison.incomparable:
