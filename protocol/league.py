@@ -15,6 +15,7 @@ from daedalus.protocol.models import NaturalInt, Specification
 
 NEWEST = "newest"  # the policy that learns, at whatever version an actor has it
 RANDOM = "random"  # legal actions, all equally probable
+DEFAULT_PAST_SHARE = 0.2  # of the matches of a game with opponents, against past versions
 MAX_PLAYER = 200  # characters
 MAX_SIDES = 1024
 _MAX_PLAYERS = 512
@@ -30,9 +31,15 @@ def version_name(policy_version: int) -> str:
     return f"v{policy_version}"
 
 
-def is_version(player: str) -> bool:
-    """Return whether a player is a kept version of the policy."""
-    return re.fullmatch(r"v(0|[1-9]\d{0,18})", player, re.ASCII) is not None
+def version_of(player: str) -> int | None:
+    """Return the policy version that a player is, or None if it is none."""
+    match = re.fullmatch(r"v(0|[1-9]\d{0,18})", player, re.ASCII)
+    return None if match is None else int(match[1])
+
+
+def is_bot(player: str) -> bool:
+    """Return whether a fixed opponent is code: the others are policies of other runs."""
+    return player == RANDOM or ":" in player
 
 
 class MatchCount(Specification):
@@ -127,7 +134,7 @@ class LeagueStatus(Specification):
     @property
     def fixed_opponents(self) -> list[str]:
         """Names of the opponents that are neither the newest policy nor versions of it."""
-        return [each.player for each in self.players if each.player != NEWEST and not is_version(each.player)]
+        return [each.player for each in self.players if each.player != NEWEST and version_of(each.player) is None]
 
     @property
     def win_rates(self) -> dict[str, float]:
@@ -152,7 +159,7 @@ class LeagueStatus(Specification):
         The newest policy stays; of the others at most half are fixed opponents, those with the most matches, and the
         rest are versions from the oldest to the newest in equal distances.
         """
-        versions = [each.player for each in self.players if is_version(each.player)]
+        versions = [each.player for each in self.players if version_of(each.player) is not None]
         matches = {each.player: each.matches for each in self.players}
         others = sorted(self.fixed_opponents, key=lambda name: -matches[name])
         others = others[: max((most - 1) // 2, most - 1 - len(versions))]

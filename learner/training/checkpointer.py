@@ -66,7 +66,8 @@ class Checkpointer:
         self._env_steps = context.counters.env_steps  # of the last checkpoint; at first, of the one that was restored
         self._advice = ""  # after the last error
         self._unfinished, self._counting = 0, threading.Lock()  # number of jobs
-        # Bounded by its users: one checkpoint, the last one, and the results of evaluations in progress.
+        # Bounded by its users: one checkpoint, the last one, the results of evaluations in progress, and one version of
+        # the league.
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         threading.Thread(target=self._work, name="checkpoints", daemon=True).start()  # it may never end: see above
 
@@ -114,12 +115,12 @@ class Checkpointer:
                 saving.done.set()
             on_end(saving)
 
-        self._add(save)
+        self.add(save)
         return saving
 
     def keep(self, evaluated: Evaluated) -> None:
         """Keep the checkpoint of an evaluation if it is among the best, and log the result."""
-        self._add(lambda: _logger.info("%s", evaluated.keep()))
+        self.add(lambda: _logger.info("%s", evaluated.keep()))
 
     def wait(self, saving: Saving, beat: Callable[[], None], *, patient: bool = True) -> bool:
         """Wait until a checkpoint is written, and return whether it is saved. A slow disk ends the wait.
@@ -167,12 +168,13 @@ class Checkpointer:
             return None
         return TrainingScore(return_mean=mean, episodes=episodes, true_task=self._spec.environment.trains_true_task)
 
-    # ------------------------------------------------------------------------------- on the thread that writes
-
-    def _add(self, job: Callable[[], None]) -> None:
+    def add(self, job: Callable[[], None]) -> None:
+        """Let the thread that writes do something, after what it was given before."""
         with self._counting:
             self._unfinished += 1
         self._jobs.put(job)
+
+    # ------------------------------------------------------------------------------- on the thread that writes
 
     def _work(self) -> None:
         while True:
