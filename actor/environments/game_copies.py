@@ -47,22 +47,26 @@ class GameCopy(Protocol):
         ...
 
 
-def game_copy(environment: Any, spec: EnvironmentSpec, seats: Sequence[str], others: OtherAction) -> GameCopy:
-    """Return a copy of a game as one of these, without the wrappers that it does not need."""
-    if not hasattr(environment, "agent_iter"):
-        return _SimultaneousGame(_in_rounds(environment, spec), seats, others)
-    return _TurnGame(_without_checks(environment, spec), seats, others)
+def game_copy(environment: Any, seats: Sequence[str], others: OtherAction) -> GameCopy:
+    """Return a copy of a game as one of these, for a PettingZoo environment."""
+    if hasattr(environment, "agent_iter"):
+        return _TurnGame(environment, seats, others)
+    return _SimultaneousGame(_in_rounds(environment), seats, others)
 
 
-def _without_checks(environment: Any, spec: EnvironmentSpec) -> Any:
-    """Return an AEC environment without PettingZoo's outer wrappers that only check or correct what its caller does.
+def without_checks(environment: Any, spec: EnvironmentSpec) -> Any:
+    """Return an environment without PettingZoo's outer wrappers that only check or correct what its caller does.
 
     They take most of the time of a small game. Here calls are always in order, and actions always in their space and
     legal by the mask: the wrappers would change nothing.
     """
     try:
         from pettingzoo.utils import wrappers
+        from pettingzoo.utils.conversions import aec_to_parallel_wrapper
     except ImportError:  # an environment with the same interface, of somebody who does without it
+        return environment
+    if type(environment) is aec_to_parallel_wrapper:
+        environment.aec_env = without_checks(environment.aec_env, spec)
         return environment
     agent = environment.possible_agents[0]
     spaces = environment.observation_space(agent), environment.action_space(agent)
@@ -206,16 +210,13 @@ class _SimultaneousGame:
         ]
 
 
-def _in_rounds(environment: Any, spec: EnvironmentSpec) -> Any:
+def _in_rounds(environment: Any) -> Any:
     """Return a parallel environment; in place of PettingZoo's conversion of an AEC environment _Rounds."""
     try:
         from pettingzoo.utils.conversions import aec_to_parallel_wrapper
-    except ImportError:  # see _without_checks
+    except ImportError:  # see without_checks
         return environment
-    if type(environment) is not aec_to_parallel_wrapper:
-        return environment
-    environment.aec_env = _without_checks(environment.aec_env, spec)
-    return _Rounds(environment)
+    return _Rounds(environment) if type(environment) is aec_to_parallel_wrapper else environment
 
 
 class _Rounds:

@@ -25,10 +25,11 @@ from daedalus.actor.environments.environment_errors import (
     import_extra,
     playing_error,
 )
-from daedalus.actor.environments.game_copies import Outcome, game_copy
+from daedalus.actor.environments.game_copies import Outcome, game_copy, without_checks
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
-from daedalus.actor.environments.rendering import render_without_display
+from daedalus.actor.environments.rendering import frame_rate, render_without_display
 from daedalus.actor.environments.vector_environments import BackendStep
+from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
@@ -54,15 +55,16 @@ class GameEnvironments:
 
         Raises EnvironmentSetupError.
         """
-        self.name, self._environments, self.agents = name, list(copies), seats
+        self.name, self.agents = name, seats
+        self._environments = [without_checks(environment, spec) for environment in copies]
         self.seats = len(seats)
         self.count = len(copies) * len(seats)
         self._numbers = {agent: number for number, agent in enumerate(seats)}
         self._random = [np.random.default_rng(number) for number in range(len(copies))]
         self._others: dict[str, LegalActions] = {}  # of the agents without a seat
         self._games = [
-            game_copy(environment, spec, seats, partial(self._random_action, number))
-            for number, environment in enumerate(copies)
+            game_copy(environment, seats, partial(self._random_action, number))
+            for number, environment in enumerate(self._environments)
         ]
         self._bots: list[Bot | None] = [None] * self.count  # of the seats, from the next match on
         self._in_match: list[Bot | None] = [None] * self.count
@@ -81,6 +83,7 @@ class GameEnvironments:
         self._warned = False
         self.resting = np.zeros(len(copies), np.bool_)  # copies that do not begin another match
         self._episode_info = EpisodeInfo()
+        self._camera: Camera | None = None
         self.acting = np.zeros(self.count, np.bool_)
         self.action_mask: Any = None
         self._has_masks: bool | None = None  # in `info`; None before the first reset
@@ -110,6 +113,7 @@ class GameEnvironments:
             self._random[number] = np.random.default_rng(seed + number)
             self._begin_match(number)
             self._note(number, self._call("reset", number, seed + number))
+        self._film()
         return self.observations
 
     def _begin_match(self, number: int) -> None:
@@ -141,6 +145,7 @@ class GameEnvironments:
                 seat = number * self.seats + self._numbers[outcome.agent]
                 rewards[seat] = outcome.reward
                 terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
+        self._film()
         return self.observations, rewards, terminated, truncated
 
     def _chosen(self, actions: Any, seat: int) -> Any:
@@ -255,6 +260,20 @@ class GameEnvironments:
             return shown
         return None
 
+    def film(self, camera: Camera) -> None:
+        """Pass an image of the first copy to a camera after each reset and each step from now on."""
+        self._camera = camera
+
+    def _film(self) -> None:
+        if self._camera is None:
+            return
+        picture = self.render()
+        if not isinstance(picture, np.ndarray):
+            raise EnvironmentSetupError(
+                f"environment {self.name} renders no image [height, width, 3]: a video of it cannot be recorded"
+            )
+        self._camera(picture, frame_rate(self._environments[0]))
+
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""
         return self._episode_info.take()
@@ -285,16 +304,28 @@ def make_games(
     further: Callable[[tuple[str, ...]], int] = lambda _: 0,
     *,
     shown: bool = False,
+    render_mode: str | None = None,
 ) -> GameEnvironments:
-    """Return `count` copies of the game that a specification names, and further ones, as its seats demand.
+    """Return copies of the game that a specification names.
 
-    `shown`: they render texts or images, if they can. Raises EnvironmentSetupError, and what `further` raises.
+    Args:
+      spec: names the game.
+      count: of copies.
+      modules: the modules that may be imported for it.
+      further: returns how many copies more the seats demand.
+      shown: whether the copies render texts or images, if they can.
+      render_mode: in place of `shown`, how they must render: "rgb_array", or "human" for a window.
+
+    Raises EnvironmentSetupError, and what `further` raises.
     """
+    make = _make_shown if shown else _make
+    if render_mode is not None:
+        make = partial(_make_rendered, mode=render_mode)
     copies: list[Any] = []
     try:
         while len(copies) < count:
             with creation_errors(spec.id, hint_of_count(len(copies), count)):
-                copies.append(_make_shown(spec, modules) if shown else _make(spec, modules))
+                copies.append(make(spec, modules))
             if len(copies) == 1:
                 seats = _seats(copies[0], spec)
                 count += further(seats)
@@ -320,6 +351,25 @@ def _make_shown(spec: EnvironmentSpec, modules: UserModules) -> Any:
         return environment
     environment.close()
     return rendered
+
+
+def _make_rendered(spec: EnvironmentSpec, modules: UserModules, mode: str) -> Any:
+    """Return a game in a render mode. Raises EnvironmentSetupError if it has none."""
+    if mode == "rgb_array":
+        render_without_display()
+    try:
+        environment = _make(spec, modules, render_mode=mode)
+    except TypeError as error:
+        if "keyword argument 'render_mode'" not in str(error):
+            raise
+        reason = "what makes it has no argument render_mode"
+    else:
+        modes = tuple(getattr(environment, "metadata", {}).get("render_modes", ()))
+        if mode in modes:
+            return environment
+        environment.close()
+        reason = f"its metadata state the render_modes {', '.join(map(str, modes)) or 'none'}"
+    raise EnvironmentSetupError(f"environment {spec.id} cannot render {mode} images: {reason}")
 
 
 def _make(spec: EnvironmentSpec, modules: UserModules, **options: Any) -> Any:

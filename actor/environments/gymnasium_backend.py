@@ -123,8 +123,6 @@ def make_gymnasium(
 
     See make_environments for the arguments. Raises EnvironmentSetupError.
     """
-    if camera is not None and (count != 1 or render_mode != "rgb_array"):
-        raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
     shutter = None if camera is None else Shutter(camera)
     factory = EnvironmentFactory(
         spec=spec, modules=modules, render_mode=render_mode, camera=shutter, one_episode=one_episode

@@ -30,7 +30,7 @@ def make_environments(
         determines, however many environments there are. It need not play another. Environments that share one random
         generator, because gymnasium registers them with a vector entry point only, are reduced to one environment.
 
-    Only the gymnasium backend supports a wrapper, `render_mode` and `camera`.
+    Only the gymnasium backend supports a wrapper, and only that and games support `render_mode` and `camera`.
 
     Raises EnvironmentSetupError; its message is one line.
     """
@@ -38,7 +38,9 @@ def make_environments(
         modules.check(spec.user_modules)
     except UserModuleError as error:
         raise EnvironmentSetupError(str(error)) from None
-    if spec.backend != "gymnasium":
+    if camera is not None and (count != 1 or render_mode != "rgb_array"):
+        raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
+    if spec.backend != "gymnasium" and not spec.is_game:
         _refuse_gymnasium_options(spec, {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera})
     bare, rest = make_bare(spec, count, modules, render_mode, camera, one_episode)
     try:
@@ -69,7 +71,10 @@ def make_bare(
         case "pettingzoo":
             from daedalus.actor.environments.games import make_games
 
-            return make_games(spec, count, modules), spec
+            games = make_games(spec, count, modules, render_mode=render_mode)
+            if camera is not None:
+                games.film(camera)
+            return games, spec
         case "ale":
             from daedalus.actor.environments.atari import make_ale
 
@@ -85,8 +90,6 @@ def make_bare(
 
 def _refuse_gymnasium_options(spec: EnvironmentSpec, asked: dict[str, object]) -> None:
     names = [name for name, value in asked.items() if value is not None]
-    if names and spec.is_game:
-        raise EnvironmentSetupError(f"games with several agents cannot be shown or filmed yet: {spec.id} is one")
     if names:
         raise EnvironmentSetupError(
             f"environment.backend={spec.backend} does not support {' and '.join(names)}: "

@@ -34,11 +34,12 @@ class CountedSteps(gymnasium.Wrapper):
         return self.env.step(action)
 
 
-def frame_rate(environment: gymnasium.Env, below: gymnasium.Env | None = None, skipped: int = 1) -> FrameRate:
+def frame_rate(environment: Any, below: gymnasium.Env | None = None, skipped: int = 1) -> FrameRate:
     """Return the rate at which the steps of an environment are meant to be shown.
 
     Args:
-      environment: as it is stepped. Its own metadata count, not those of its class: MuJoCo's depend on `frame_skip`.
+      environment: of gymnasium or PettingZoo, as it is stepped. Its own metadata count, not those of its class:
+        MuJoCo's depend on `frame_skip`.
       below: the environment without the user's wrapper.
       skipped: how many steps of `below` one step makes. It divides the rate, unless the wrapper states a rate.
     """
@@ -46,7 +47,7 @@ def frame_rate(environment: gymnasium.Env, below: gymnasium.Env | None = None, s
     if below is not None and repr(stated) == repr(_stated(below)):
         rate = frame_rate(below)
         return rate._replace(per_second=max(rate.per_second / max(skipped, 1), _RATES[0]))
-    registered = environment.spec
+    registered = getattr(environment, "spec", None)  # PettingZoo's have none
     if registered is not None and str(registered.entry_point).startswith("ale_py"):  # states 30 for any frameskip
         frames = registered.kwargs.get("frameskip", 4)  # of a tuple, a random number from the first to below the second
         mean = frames if isinstance(frames, int) else (frames[0] + frames[1] - 1) / 2
@@ -66,7 +67,7 @@ def frame_rate(environment: gymnasium.Env, below: gymnasium.Env | None = None, s
     )
 
 
-def _stated(environment: gymnasium.Env) -> Any:
+def _stated(environment: Any) -> Any:
     """Return what an environment states as `render_fps`, of any type; None if it states nothing."""
     try:
         metadata = environment.metadata

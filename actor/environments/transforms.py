@@ -220,6 +220,11 @@ class TransformedEnvironment:
         return np.where(resets, 0.0, rewards)
 
     @property
+    def agents(self) -> tuple[str, ...]:
+        """The agents of the seats of each game; empty if there are no games."""
+        return () if self._games is None else self._games.agents
+
+    @property
     def action_names(self) -> tuple[str, ...]:
         """What the environment calls its choices; empty if it does not say."""
         return getattr(self._environments, "action_names", ())

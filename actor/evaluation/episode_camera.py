@@ -39,10 +39,10 @@ class Moment:
     picture: np.ndarray  # [height, width, 3] uint8, after the step
     seconds: float  # that the step takes at the environment's own speed
     step: int  # from 1 in each episode
-    reward: float
+    reward: float  # in a game with several agents, their mean
     total: float  # of the rewards of this episode
-    value: float | None  # estimate before the step; None if it is not known
-    actions: list[dict[str, Any]]  # see action_facts
+    value: float | None  # estimate before the step, the mean of the agents that act; None if it is not known
+    actions: list[dict[str, Any]]  # of the agents that act, see action_facts
 
 
 class EpisodeCamera:
@@ -61,8 +61,10 @@ class EpisodeCamera:
         )
         played = self._environments
         self._names: tuple[str, ...] = ()
-        if isinstance(played, TransformedEnvironment) and not environment.action_table:
-            self._names = played.action_names
+        self._agents = ("",)
+        if isinstance(played, TransformedEnvironment):
+            self._names = () if environment.action_table else played.action_names
+            self._agents = played.agents or self._agents
         self._longest = spec.evaluation.max_episode_env_steps
         self._random = np.random.default_rng()
 
@@ -80,37 +82,62 @@ class EpisodeCamera:
         self._environments.close()
 
     def play(self, runtime: OnnxRuntime) -> Iterator[Moment]:
-        """Play one episode with the most probable actions, and yield each step. Raises EnvironmentSetupError."""
-        environments, spaces = self._environments, self._environments.spaces
-        running = RunningEpisodes(spaces, runtime, 1)
-        running.observe(environments.reset(int(self._random.integers(_SEEDS))))
+        """Play one episode with the most probable actions, and yield each step. Raises EnvironmentSetupError.
+
+        The policy plays all agents of a game.
+        """
+        environments, spaces, seats = self._environments, self._environments.spaces, len(self._agents)
+        running = RunningEpisodes(spaces, runtime, seats)
+        observed = environments.reset(int(self._random.integers(_SEEDS)))
+        running.observe(observed)
+        acting = np.arange(seats) if observed.acting is None else np.flatnonzero(observed.acting)
         total = 0.0
         for step in range(1, self._longest + 1):
-            value = self._estimate(running.observations, running.state)
+            value = self._value(running, acting)
             choice = running.act(self._noise(runtime.noise_size, running.observations))
-            taken = {name: values[:1] for name, values in choice.actions.items()}
+            taken = {name: values[:seats] for name, values in choice.actions.items()}
             self._seconds = 0.0
             observed, rewards, terminated, truncated = environments.step(taken)
-            refuse_unfit_rewards(rewards, np.zeros(1, np.int64))
+            refuse_unfit_rewards(rewards, np.zeros(seats, np.int64))
             running.observe(observed)
-            total += float(rewards[0])
-            facts = action_facts(spaces, choice, self._names)
+            total += float(rewards.mean())
             yield Moment(
                 picture=self._picture,
                 seconds=self._seconds,
                 step=step,
-                reward=float(rewards[0]),
+                reward=float(rewards.mean()),
                 total=total,
                 value=value,
-                actions=facts,
+                actions=self._facts(choice, acting),
             )
-            if terminated[0] or truncated[0]:
+            ended = terminated | truncated
+            if ended[0] if observed.over is None else observed.over[0]:
                 return
+            if observed.acting is not None:
+                acting = np.flatnonzero(observed.acting & ~ended)
+
+    def _value(self, running: RunningEpisodes, acting: np.ndarray) -> float | None:
+        values = [
+            self._estimate({name: rows[[seat]] for name, rows in running.observations.items()}, running.state[[seat]])
+            for seat in acting
+        ]
+        known = [value for value in values if value is not None]
+        return float(np.mean(known)) if known else None
+
+    def _facts(self, choice: Choice, acting: np.ndarray) -> list[dict[str, Any]]:
+        facts, seats = [], len(self._agents)
+        for seat in acting[:_MOST_SHOWN]:
+            values = {name: rows[seat::seats] for name, rows in choice.actions.items()}
+            of_seat = Choice(values, choice.log_probs[seat::seats], choice.state[seat::seats])
+            for fact in action_facts(self.spaces, of_seat, self._names):
+                facts.append({**fact, "name": " ".join((self._agents[seat], fact["name"])).strip()})
+        return facts[:_MOST_SHOWN]
 
     def _noise(self, size: NoiseSize, observations: dict[str, np.ndarray]) -> Noise:
-        """Return noise that gives the most probable action in row 0, and samples in the other rows."""
+        """Return noise that gives the most probable action in the first row of each seat, and samples in the others."""
         samples = _FEW_SAMPLES if sum(values.size for values in observations.values()) > _LARGE else _SAMPLES
-        return joined_noise([neutral_noise(size, 1), draw_noise(size, samples, self._random)])
+        seats = len(self._agents)
+        return joined_noise([neutral_noise(size, seats), draw_noise(size, samples * seats, self._random)])
 
 
 def action_facts(spaces: Spaces, choice: Choice, names: Sequence[str] = ()) -> list[dict[str, Any]]:

@@ -285,6 +285,10 @@ class Duel(ParallelEnv):
         return {agent: {"action_mask": mask} for agent in self.possible_agents}
 
 
+def dark(render_mode: str) -> Duel:
+    return Duel()
+
+
 def test_a_game_is_checked() -> None:
     report = make()
     assert report.problems == ()
@@ -316,12 +320,12 @@ def test_the_backend_of_a_game_of_one_s_own_is_suggested() -> None:
     assert "--set environment.backend=pettingzoo" in report.problems[0]
 
 
-def test_games_are_not_shown_yet() -> None:
-    spec = as_on_gymnasium(EnvironmentSpec(id="pettingzoo.classic.tictactoe_v3"))
-    with pytest.raises(
-        EnvironmentSetupError, match=r"cannot be shown or filmed yet: pettingzoo\.classic\.tictactoe_v3"
-    ):
-        make_environments(spec, 1, render_mode="rgb_array")
+@pytest.mark.parametrize(("field", "reason"), [("problem", "what makes it has no"), ("render_mode", "its metadata")])
+def test_games_that_render_no_images_cannot_be_filmed(field: str, reason: str) -> None:
+    game = {"problem": "test_games:Duel", "render_mode": "test_games:dark"}[field]
+    spec = as_on_gymnasium(EnvironmentSpec(id=game, backend="pettingzoo"))
+    with pytest.raises(EnvironmentSetupError, match=f"cannot render rgb_array images: {reason}"):
+        make_environments(spec, 1, render_mode="rgb_array", modules=UserModules(frozenset({"test_games"})))
 
 
 def test_one_agent_of_two_may_be_the_policys() -> None:

@@ -245,6 +245,13 @@ def test_a_video_of_an_atari_game_uses_gymnasiums_implementation(tmp_path: Path,
     assert on_gymnasium["video_seconds"] == 2 * 41 / 60
 
 
+def test_a_video_of_a_game_has_a_frame_for_each_step(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    run = save(tmp_path / "run", EnvironmentSpec(id="pettingzoo.classic.tictactoe_v3"), 1)
+    filmed = evaluate(run, "--video", tmp_path / "game.gif", "--episodes", 2, "--seed", 1)
+    assert filmed["video_seconds"] == sum(filmed["lengths"]) + 2  # a frame a second, and one before each match
+    assert filmed["lengths"] == evaluate(run, "--episodes", 2, "--seed", 1)["lengths"]
+
+
 def test_max_seconds_ends_the_gif_and_the_evaluation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     options = ("--video", tmp_path / "short.gif", "--episodes", 3, "--seed", 1)

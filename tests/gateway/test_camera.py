@@ -117,6 +117,23 @@ def test_an_episode_is_played_with_pictures() -> None:
     assert jpeg(moments[0].picture)[:3] == b"\xff\xd8\xff"
 
 
+def test_all_agents_of_a_game_are_played_and_their_actions_named() -> None:
+    game = SPEC.environment.model_copy(update={"id": "pettingzoo.classic.tictactoe_v3", "backend": "pettingzoo"})
+    spec = SPEC.model_copy(update={"environment": game})
+    with closing(EpisodeCamera(spec.for_actors(), NO_MODULES, lambda observations, state: float(len(state)))) as camera:
+        policy = Policy.of(spec.policy, camera.spaces)
+        acting = OnnxRuntime(policy.model)
+        acting.load({name: value.detach().numpy() for name, value in policy.network.named_parameters()})
+        moments = list(camera.play(acting))
+    names = [[fact["name"] for fact in moment.actions] for moment in moments]
+    assert names == [[f"player_{1 + number % 2} action"] for number in range(len(moments))]
+    taken = [choice for moment in moments for choice, _, was_taken in moment.actions[0]["choices"] if was_taken]
+    assert len(set(taken)) == len(moments) >= 5  # no field twice
+    assert all(sum(share for _, share, _ in moment.actions[0]["choices"]) > 0.9 for moment in moments)
+    assert {moment.value for moment in moments} == {1.0}
+    assert (moments[0].picture != moments[-1].picture).any()
+
+
 @pytest.mark.skipif(find_library("EGL") is None, reason="libEGL is not installed")
 def test_mujoco_is_rendered_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco")
