@@ -142,7 +142,7 @@ def _training(record: RunRecord, spec: RunSpec) -> str:
         *(
             []
             if rating is None
-            else [("rating in its league", f"{written(rating)} ± {written(record.number(DEVIATION))}")]
+            else [("rating in its league", f"{rating:,.0f} ± {record.number(DEVIATION) or 0.0:,.0f}")]
         ),
         *((f"win rate against {name}", f"{rate:.0%}") for name, rate in rates.items()),
         ("env_steps", written(record.number("env_steps"))),

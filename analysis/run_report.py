@@ -34,7 +34,7 @@ from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.settings import changed_settings, setting_text, value_text
 from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
 from daedalus.protocol.league import NEWEST, LeagueStatus, Score
-from daedalus.protocol.texts import printable, short_number
+from daedalus.protocol.texts import printable
 
 _STYLE = Path(__file__).with_name("report_style.css")
 # The browser itself enforces that the page loads nothing from elsewhere and runs no script.
@@ -180,7 +180,7 @@ def summary_tiles(record: RunRecord) -> ET.Element:
             values.append(("interquartile mean", written(value), interval))
     rating, deviation = record.number(RATING), record.number(DEVIATION)
     if rating is not None:
-        values.append(("rating", f"{written(rating)} ± {written(deviation)}", "of the newest policy in its league"))
+        values.append(("rating", f"{rating:,.0f} ± {deviation or 0.0:,.0f}", "of the newest policy in its league"))
     trained = record.number("episode_return_mean")
     values.append(("training", written(trained), "mean return of the newest episodes"))
     budget = record.settings.get("training.env_steps")
@@ -489,7 +489,10 @@ def league_section(group: Group[RunRecord], by: str) -> ET.Element | None:
     chart, league = _large_chart([group], RATING, "rating of the newest policy", by), record.league
     if chart is None and league is None:
         return None
-    explained = "The skill of a player is within ± of its rating in two of three cases. The band is this deviation."
+    explained = (
+        "A player with 200 points more wins 76 of 100 matches. Its skill is within ± of its rating in two of three "
+        "cases; the band is this deviation."
+    )
     if league is None:
         players = element("p", "The learner records the results between the players at its end.", class_="note")
         return section("League", chart, element("p", explained, class_="muted"), players)
@@ -497,7 +500,7 @@ def league_section(group: Group[RunRecord], by: str) -> ET.Element | None:
     rows = [
         (
             each.player,
-            f"{short_number(each.rating)} ± {short_number(each.deviation)}",
+            each.text.replace("+-", "±"),
             f"{each.matches:,}",
             f"{scores[each.player].win_rate:.0%}" if each.player in scores else "-",
         )
@@ -531,7 +534,7 @@ def _win_rates(league: LeagueStatus) -> ET.Element:
 
 def _win_rate(score: Score | None) -> Child:
     if score is None:
-        return "-"
+        return element("span", "-")
     rate = score.win_rate
     results = f"{score.wins:.4g} won, {score.draws:.4g} drawn, {score.losses:.4g} lost"
     return element(

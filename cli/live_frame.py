@@ -122,7 +122,7 @@ def _head(run: WatchedRun, width: int, ascii_only: bool) -> list[RenderableType]
 def _strength(status: RunStatus) -> str:
     """Return the rating of the newest policy with its deviation, or the mean return where there is no rating."""
     if status.league and (newest := status.league.newest):
-        return f"rating {short_number(newest.rating):>8} +- {short_number(newest.deviation)}"
+        return f"rating {newest.text:>14}"
     return f"return {'-' if status.episode_return_mean is None else short_number(status.episode_return_mean):>8}"
 
 

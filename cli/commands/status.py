@@ -251,7 +251,7 @@ def _table(status: RunStatus) -> list[str]:
     mean = "-" if status.episode_return_mean is None else short_number(status.episode_return_mean)
     league = status.league if status.league and status.league.players else None
     newest = league.newest if league else None
-    rating = f"rating {short_number(newest.rating)} +- {short_number(newest.deviation)}, " if newest else ""
+    rating = f"rating {newest.text}, " if newest else ""
     age = status.checkpoint_age_seconds
     skipped = f" ({status.updates_skipped:,} skipped)" if status.updates_skipped else ""
     agents = "" if status.agent_steps is None else f" ({status.agent_steps:,} agent_steps)"
@@ -291,7 +291,7 @@ def _league_table(league: LeagueStatus) -> list[str]:
     scores, rows = league.scores_of(NEWEST), [["player", "rating", "+-", "matches", "newest wins"]]
     for each in (player for player in by_rating if player in first):
         wins = f"{scores[each.player].win_rate:.0%}" if each.player in scores else "-"
-        numbers = short_number(each.rating), short_number(each.deviation), f"{each.matches:,}"
+        numbers = f"{round(each.rating):,}", f"{round(each.deviation):,}", f"{each.matches:,}"
         rows.append([one_line(each.player)[:_LONGEST_PLAYER], *numbers, wins])
     more = len(by_rating) - len(first) + league.left_out
     return [*_aligned(rows, {0}), *([f"  ... and {more:,} more players"] if more else [])]

@@ -344,10 +344,8 @@ def _rated(summary: dict[str, Any]) -> list[str]:
     if league.newest is None:
         return []
     wins = ", ".join(f"{rate:.0%} against {name}" for name, rate in league.win_rates.items())
-    rating = (
-        f"rating {short_number(league.newest.rating)} +- {short_number(league.newest.deviation)} of the newest policy"
-    )
-    return [printable(f"league: {rating}{f'; wins {wins}' if wins else ''}")]
+    rating = f"league: rating {league.newest.text} of the newest policy"
+    return [printable(f"{rating}; wins {wins}" if wins else rating)]
 
 
 def show(text: str, command: str) -> None:

@@ -56,7 +56,7 @@ function columns([low, high]) {
   };
   return [
     { name: "player", title: "Player", text: (row) => row.player, value: (row) => row.player },
-    { name: "rating", title: "Rating", number: true, text: (row) => `${number(row.rating)} ± ${number(row.deviation, 2)}`, value: (row) => row.rating },
+    { name: "rating", title: "Rating", number: true, text: (row) => `${whole(row.rating)} ± ${whole(row.deviation)}`, value: (row) => row.rating },
     { name: "band", title: "Band", draw, value: (row) => row.deviation },
     { name: "matches", title: "Matches", number: true, text: (row) => whole(row.matches), value: (row) => row.matches },
     { name: "wins", title: "Newest wins", number: true, text: ({ score }) => (score ? percent(score.rate) : "-"), value: ({ score }) => score?.rate ?? -1 },

@@ -77,7 +77,7 @@ export class Summary {
   #result(status) {
     if (status === null) return "";
     const rating = this.metrics.newest("rating");
-    const strength = rating === null ? `return ${number(status.episode_return_mean)}` : `rating ${number(rating)}`;
+    const strength = rating === null ? `return ${number(status.episode_return_mean)}` : `rating ${whole(rating)}`;
     return `Result: ${strength} after ${whole(status.env_steps)} env_steps and ${whole(status.updates)} updates.`;
   }
 
@@ -99,7 +99,7 @@ export class Summary {
     const evaluated = metrics.newest("evaluation_env_steps");
     const saved = status.checkpoint_age_seconds;
     const rating = metrics.newest("rating");
-    if (rating !== null) this.#tile("Rating", number(rating), `± ${number(metrics.newest("rating_deviation"), 2)}, of the newest policy`);
+    if (rating !== null) this.#tile("Rating", whole(rating), `± ${whole(metrics.newest("rating_deviation"))}, of the newest policy`);
     this.#tile("Return", number(status.episode_return_mean), deviation === null ? "no episode yet" : `± ${number(deviation)} between episodes`);
     this.#tile(
       "Evaluation",

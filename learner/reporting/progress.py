@@ -102,7 +102,7 @@ def _parts(row: Mapping[str, float], budget: int, updates_per_batch: int) -> lis
 def _strength(row: Mapping[str, float]) -> str:
     """Return how good the policy is. In a game with opponents that is a rating: what one side wins, the other loses."""
     if "rating" in row:
-        return f"rating {short_number(row['rating']):>6} +- {short_number(row['rating_deviation'])}"
+        return f"rating {round(row['rating']):>6,} +- {round(row['rating_deviation']):,}"
     mean = short_number(row["episode_return_mean"]) if "episode_return_mean" in row else "-"
     return f"return {mean:>7}"
 

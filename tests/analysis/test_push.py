@@ -118,7 +118,7 @@ def test_the_model_card_has_the_results(hub: HubServer) -> None:
     assert "daedalus evaluate --from-hub ada/cart" in text
     assert "| 95 % bootstrap interval | " in text
     assert "| rollout rejected (times) | 3 |" in text
-    assert "| rating in its league | 31.2 ± 0.875 |" in text
+    assert "| rating in its league | 1,312 ± 50 |" in text
     assert "| win rate against random | 97% |" in text
     assert "arm-on-host-7" not in b"".join(hub.files("ada/cart").values()).decode("utf-8", "replace")
 

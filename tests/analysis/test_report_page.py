@@ -39,7 +39,7 @@ def reports(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> list[Path
     (poor / "replay.gif").write_bytes(GIF)
     record(folder / "other", settings=["collection.rollout_length=7"], returns=[None, None, 1.0])
     record(folder / "acrobot", preset="acrobot")
-    players = (RatedPlayer(player=HOSTILE, rating=1.0, deviation=1.0), *LEAGUE.players)
+    players = (RatedPlayer(player=HOSTILE, rating=-1.0, deviation=1.0), *LEAGUE.players)
     game = record(folder / "game", league=LEAGUE.model_copy(update={"players": players, "left_out": 5}))
     assert report([str(rich)]) == report([str(poor)]) == report([str(game)]) == 0
     assert report([str(folder), "--output", str(folder / "report.html")]) == 0
@@ -91,10 +91,10 @@ def test_a_game_with_opponents_has_ratings_and_a_matrix(reports: list[Path], ope
     page = opened(reports[3])
     assert page.locator("h2").first.inner_text() == "League"
     rows = page.get_by_role("region", name="players by rating").locator("tbody tr").all_inner_texts()
-    assert rows[0].split("\t") == ["newest", "31.2 ± 0.875", "1,200", "-"]
-    assert rows[-1].split("\t") == [printable(HOSTILE), "1 ± 1", "0", "-"]
+    assert rows[0].split("\t") == ["newest", "1,312 ± 50", "1,200", "-"]
+    assert rows[-1].split("\t") == [printable(HOSTILE), "-1 ± 1", "0", "-"]
     assert page.locator("text=5 more players are not shown").count() == 1
-    cell = page.locator(".matrix tr:has(th:text-is('v0')) td span").first
+    cell = page.locator(".matrix tr:has(th:text-is('v0')) td span").nth(1)
     assert (cell.inner_text(), cell.get_attribute("class")) == ("75", "wins")
     assert cell.get_attribute("title") == "v0 against newest: 75% of 40 matches (30 won, 0 drawn, 10 lost)"
     assert page.locator("figcaption", has_text="win rate against random").count() == 1

@@ -81,7 +81,7 @@ def test_a_frame_of_a_game_with_opponents_shows_ratings() -> None:
         MetricsReport(page=page, numbers=np.array([0, 1]), values=np.array([[1.0, 3.0, 0.0], [2.0, 5.0, 0.0]]))
     )
     text = "\n".join(drawn(run))
-    assert "rating     31.2 +- 0.875  ▁█" in text
+    assert "rating    1,312 +- 50  ▁█" in text
     assert "newest wins against  my_bots:Greedy 75%  random 97%" in text
 
 

@@ -60,7 +60,7 @@ def test_the_values_of_a_run_and_its_actors_are_exported() -> None:
 
 def test_the_rating_and_the_win_rates_of_a_game_are_exported() -> None:
     samples = scraped(run_status(league=LEAGUE))
-    assert value(samples, "daedalus_rating", run="mine") == 31.25
+    assert value(samples, "daedalus_rating", run="mine") == 1312.5
     assert value(samples, "daedalus_win_rate", run="mine", opponent="random") == 0.97
     assert value(samples, "daedalus_win_rate", run="mine", opponent="my_bots:Greedy") == 0.75
 

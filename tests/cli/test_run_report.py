@@ -33,7 +33,7 @@ def test_notes_of_the_evaluation_are_printed() -> None:
 
 def test_the_rating_of_a_game_with_opponents_is_printed() -> None:
     run = LocalRun(directory=Path("runs/one"), spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1")), started=0.0)
-    line = "league: rating 31.2 +- 0.875 of the newest policy; wins 75% against my_bots:Greedy, 97% against random"
+    line = "league: rating 1,312 +- 50 of the newest policy; wins 75% against my_bots:Greedy, 97% against random"
     assert report(run, {**SUMMARY, "league": LEAGUE.model_dump(mode="json")}).splitlines()[1] == line
     assert "league" not in report(run, SUMMARY)
 

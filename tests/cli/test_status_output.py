@@ -70,15 +70,15 @@ def test_policy_lag_is_shown_in_batches(printed: Print) -> None:
 
 def test_players_of_a_league_are_listed_by_rating(printed: Print) -> None:
     shown = printed(run_status(league=LEAGUE, episode_return_mean=0.0)).splitlines()
-    assert any(line.startswith("  rating 31.2 +- 0.875, return 0, env_steps 100 of") for line in shown)
+    assert any(line.startswith("  rating 1,312 +- 50, return 0, env_steps 100 of") for line in shown)
     begin = next(index for index, line in enumerate(shown) if line.split()[0] == "player")
     assert [line.split() for line in shown[begin + 1 : begin + 7]] == [
-        ["newest", "31.2", "0.875", "1,200", "-"],
-        ["v200", "30.0", "1", "70", "95%"],
-        ["v100", "28.0", "1.5", "80", "-"],
-        ["my_bots:Greedy", "25.0", "1", "60", "75%"],
-        ["v0", "20.0", "2", "90", "25%"],
-        ["random", "12.0", "2.5", "50", "97%"],
+        ["newest", "1,312", "50", "1,200", "-"],
+        ["v200", "300", "10", "70", "95%"],
+        ["v100", "280", "15", "80", "-"],
+        ["my_bots:Greedy", "250", "10", "60", "75%"],
+        ["v0", "200", "20", "90", "25%"],
+        ["random", "0", "0", "50", "97%"],
     ]
     versions = tuple(RatedPlayer(player=f"v{number}", rating=number, deviation=1.0) for number in range(20))
     many = LEAGUE.model_copy(update={"players": (*LEAGUE.players[:1], *versions, *LEAGUE.players[-2:]), "left_out": 3})

@@ -274,14 +274,14 @@ def test_a_game_with_opponents_shows_ratings_and_who_beats_whom(gateway: Running
     show(gateway, run_status(league=league), rows)
     page = visit(f"http://127.0.0.1:{gateway.port}/").page
     page.wait_for_selector("#matrix tbody tr")
-    assert page.locator("#rating svg").get_attribute("aria-label") == "Rating: 31.3 at the end, from 0 to 20"
+    assert page.locator("#rating svg").get_attribute("aria-label") == "Rating: 1,313 at the end, from 0 to 20"
     assert page.locator("#win-rates h3").all_inner_texts() == [
         "Win rate against my_bots.Greedy",
         "Win rate against random",
     ]
-    assert text_of(page, "#tiles .tile:first-child").split("\n") == ["Rating", "31.3", "± 0.88, of the newest policy"]
+    assert text_of(page, "#tiles .tile:first-child").split("\n") == ["Rating", "1,313", "± 50, of the newest policy"]
     best = page.locator("#players tbody tr").first
-    assert best.locator("td").all_inner_texts() == ["newest", "31.3 ± 0.88", "", "1,200", "-"]
+    assert best.locator("td").all_inner_texts() == ["newest", "1,313 ± 50", "", "1,200", "-"]
     assert text_of(page, "#players tr:has(td:text-is('random')) td:last-child") == "97 %"
     assert "3 players more are kept" in text_of(page, "#league-note")
     cell = page.locator("#matrix tr:has(th:text-is('v0')) td").nth(1)  # hostile, newest, v0, ...

@@ -151,5 +151,5 @@ def test_small_rates_are_not_shown_as_0(screen: Screen) -> None:
 
 def test_a_rating_stands_in_place_of_a_return_that_is_0_by_construction(screen: Screen) -> None:
     Progress(screen, 1000).show(row(100, episode_return_mean=0.0, **league_columns(LEAGUE)))
-    assert "rating   31.2 +- 0.875  wins against my_bots.Greedy 75%, random 97%" in screen.getvalue()
+    assert "rating  1,312 +- 50  wins against my_bots.Greedy 75%, random 97%" in screen.getvalue()
     assert "return" not in screen.getvalue()
