@@ -80,11 +80,15 @@ def application(gateway: "asyncio.Future[Gateway]", guard: Guard, data: PageData
     async def play_page(request: Request) -> Response:
         return _response(assets["play.html"]) if data.takes_clients else PlainTextResponse(_NO_CLIENTS, 403)
 
+    async def match_page(request: Request) -> Response:
+        return _response(assets["match.html"])
+
     routes: list[BaseRoute] = [
         WebSocketRoute("/actor", Actor()),
         WebSocketRoute("/watch", Watch()),
         Route("/", run_page),
         Route("/play", play_page),
+        Route("/match", match_page),
         Route("/page/{name}", asset),
         Route("/protocol.json", _protocol),
     ]

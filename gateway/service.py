@@ -20,8 +20,10 @@ from daedalus.gateway.security import LOOPBACK, OperatorToken, Tokens, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.watching.camera import CameraProcess
 from daedalus.gateway.watching.learner_source import LearnerSource
+from daedalus.gateway.watching.matches import Matches
 from daedalus.gateway.watching.monitor import RunMonitor
 from daedalus.gateway.watching.page_data import Observation, OtherRun, PageData, ReadFolder
+from daedalus.gateway.watching.playing_process import PolicySource
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import Order
 from daedalus.transport.connecting import connect_with_retry
@@ -56,6 +58,7 @@ class GatewaySettings:
     other_runs: Callable[[], list[OtherRun]] = lambda: []
     read_folder: ReadFolder = lambda run: None
     camera: tuple[str, ...] | None = None  # command of the camera's process; None: no camera
+    match: tuple[str, ...] | None = None  # the same of a person's match against the policy
     announce: Callable[[str], None] | None = None  # receives the address of the page, instead of the log
 
 
@@ -69,8 +72,10 @@ class GatewayService:
         self._ended, self._failures = asyncio.Event(), list[Exception]()
         self._gateway: asyncio.Future[Gateway] = self._loop.create_future()
         self._monitor: RunMonitor | None = None
-        self._camera = None if settings.camera is None else CameraProcess(settings.camera)
-        self._data = PageData(settings.other_runs, self._camera, takes_clients=settings.takes_clients)
+        self._policies = PolicySource()
+        self._camera = None if settings.camera is None else CameraProcess(settings.camera, self._policies)
+        self._matches = None if settings.match is None else Matches(settings.match, self._policies)
+        self._data = PageData(settings.other_runs, self._camera, self._matches, takes_clients=settings.takes_clients)
         self._transports = ExitStack()
         owner = settings.credentials.name if settings.credentials else ""
         name = f"{owner or 'gateway'}.gateway-{os.getpid()}"
@@ -124,9 +129,7 @@ class GatewayService:
             gateway = Gateway(transport, self._config, self._fail)
             gateway.open()
             self._gateway.set_result(gateway)
-            if self._camera is not None:
-                self._camera.newest_policy = lambda: gateway.newest_policy
-                self._camera.fetch_policy = gateway.fetch_policy
+            self._policies.newest, self._policies.fetch = lambda: gateway.newest_policy, gateway.fetch_policy
             watching = transport
             if self._settings.operator is not None:
                 watching = await self._connect(self._settings.operator)
@@ -181,8 +184,7 @@ class GatewayService:
     async def _close(self) -> None:
         """Close all parts side by side: each may wait for some seconds."""
         closing = [self._close_gateway(), self._close_page()]
-        if self._camera is not None:
-            closing.append(self._camera.close())
+        closing += [part.close() for part in (self._camera, self._matches) if part is not None]
         await asyncio.gather(*closing)
 
     async def _close_page(self) -> None:

@@ -1,7 +1,7 @@
 """The process of a gateway's camera: plays episodes with the newest policy, and writes what the page shows.
 
-The gateway starts it while somebody watches. It has no network: see gateway/watching/camera.py for its messages. It
-runs at the lowest priority. Exit status: 0 the gateway has closed its input or stopped it, 1 failed.
+The gateway starts it while somebody watches. It has no network: see gateway/watching/playing_process.py for its
+messages. It runs at the lowest priority. Exit status: 0 the gateway has closed its input or stopped it, 1 failed.
 """
 
 import argparse
@@ -17,8 +17,9 @@ import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
-from daedalus.gateway.watching.camera import LENGTH, frame, note
+from daedalus.gateway.watching.playing_process import frame, note
 from daedalus.launch.logs import configure_logging
+from daedalus.launch.playing_child import NICENESS, PlayingInput, reserved_stdout, write_frame
 from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, stop_on_signals
 from daedalus.learner.run.run_directory import run_name
 from daedalus.policy.acting.program_check import PolicyError
@@ -27,9 +28,7 @@ from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.codec import ProtocolError, decode
-from daedalus.protocol.limits import LEARNER_LIMITS
-from daedalus.protocol.messages import Message, Program, Snapshot, Welcome
+from daedalus.protocol.codec import ProtocolError
 
 _logger = logging.getLogger("daedalus.launch.camera_process")
 
@@ -71,53 +70,7 @@ def _unknown(observations: dict[str, np.ndarray], state: np.ndarray) -> float | 
 
 FRAMES_PER_SECOND = 15.0
 _LONGEST_SECONDS = 1.0  # for one frame, for somebody who waits
-_NICENESS = 19
-_READ_BYTES = 1 << 20
 _BETWEEN_EPISODES_SECONDS = 0.7
-
-
-class _Input:
-    """What the gateway sends, read on a thread of its own."""
-
-    def __init__(self, descriptor: int, stop: threading.Event) -> None:
-        self._descriptor, self._stop = descriptor, stop  # not a buffered stream, whose lock the thread would hold
-        self.newest: Snapshot | None = None
-
-    def begin(self) -> tuple[Welcome, Program]:
-        """Return the first two messages, and read the snapshots from then on. Raises EOFError or ProtocolError."""
-        welcome, program = self._read(), self._read()
-        if not isinstance(welcome, Welcome) or not isinstance(program, Program):
-            raise ProtocolError("the first messages are no Welcome and Program")
-        self._keep()
-        threading.Thread(target=self._follow, name="input", daemon=True).start()
-        return welcome, program
-
-    def _follow(self) -> None:
-        try:
-            while True:
-                self._keep()
-        except EOFError:
-            self._stop.set()
-
-    def _keep(self) -> None:
-        message = self._read()
-        if isinstance(message, Snapshot):
-            self.newest = message
-
-    def _read(self) -> Message:
-        (length,) = LENGTH.unpack(self._exactly(LENGTH.size))
-        if length > LEARNER_LIMITS.message_bytes:
-            raise ProtocolError(f"a message of {length} bytes")
-        return decode(self._exactly(length), LEARNER_LIMITS)
-
-    def _exactly(self, length: int) -> bytes:
-        data = bytearray()
-        while len(data) < length:
-            part = os.read(self._descriptor, min(length - len(data), _READ_BYTES))
-            if not part:
-                raise EOFError
-            data += part
-        return bytes(data)
 
 
 class _Output:
@@ -137,8 +90,7 @@ class _Output:
 
     def write(self, data: bytes) -> None:
         """Write a frame now."""
-        self._stream.write(LENGTH.pack(len(data)) + data)
-        self._stream.flush()
+        write_frame(self._stream, data)
 
 
 def main(output: BinaryIO) -> int:
@@ -150,12 +102,12 @@ def main(output: BinaryIO) -> int:
     if arguments.checkpoints is not None:  # the environment may change the working directory
         arguments.checkpoints = Path(os.path.abspath(arguments.checkpoints))
     configure_logging("warning", as_json=False, process="camera")
-    os.nice(_NICENESS)
+    os.nice(NICENESS)
     stop = stop_on_signals(exit_if_stuck=True)
     frames = _Output(output, stop)
     try:
         modules = UserModules(frozenset(arguments.allow_module), "the run")
-        _film(_Input(sys.stdin.fileno(), stop), frames, modules, arguments.checkpoints, stop)
+        _film(PlayingInput(sys.stdin.fileno(), stop), frames, modules, arguments.checkpoints, stop)
     except EOFError:
         return 0
     except ImportError:
@@ -172,7 +124,7 @@ def main(output: BinaryIO) -> int:
 
 
 def _film(
-    given: _Input, frames: _Output, modules: UserModules, checkpoints: Path | None, stop: threading.Event
+    given: PlayingInput, frames: _Output, modules: UserModules, checkpoints: Path | None, stop: threading.Event
 ) -> None:
     welcome, program = given.begin()
     runtime = OnnxRuntime(program.model.tobytes(), stop)
@@ -195,13 +147,6 @@ def _film(
         camera.close()
 
 
-def _reserved_stdout() -> BinaryIO:
-    """Return standard output for frames alone: what an environment prints goes to standard error."""
-    reserved = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return reserved
-
-
 if __name__ == "__main__":
     exit_on_thread_exceptions(plays=True)
-    sys.exit(exit_status(lambda: main(_reserved_stdout())))
+    sys.exit(exit_status(lambda: main(reserved_stdout())))

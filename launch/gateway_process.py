@@ -169,18 +169,11 @@ def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
         listener.close()
 
 
-def _camera(options: GatewayOptions) -> tuple[str, ...]:
-    """Return the command of the camera's process."""
-    directory = options.run_directory
-    values = [] if directory is None else ["--checkpoints", str(directory)]
-    return (
-        sys.executable,
-        "-P",
-        "-m",
-        "daedalus.launch.camera_process",
-        *allow_words(options.allowed_modules),
-        *values,
-    )
+def _playing(options: GatewayOptions, module: str, *words: str) -> tuple[str, ...] | None:
+    """Return the command of a process that plays for the page, or None if none shall."""
+    if not options.camera:
+        return None
+    return (sys.executable, "-P", "-m", f"daedalus.launch.{module}", *allow_words(options.allowed_modules), *words)
 
 
 def _announce(token_file: Path | None) -> Callable[[str], None]:
@@ -196,6 +189,7 @@ async def _serve(options: GatewayOptions, chosen: "_Chosen", listener: socket.so
     # Imported here, because its packages are an extra.
     from daedalus.gateway.service import GatewayService, GatewaySettings
 
+    values = [] if options.run_directory is None else ["--checkpoints", str(options.run_directory)]
     settings = GatewaySettings(
         connect=options.connect,
         shown_host=options.listen.rpartition(":")[0],
@@ -208,7 +202,8 @@ async def _serve(options: GatewayOptions, chosen: "_Chosen", listener: socket.so
         operator_token=chosen.operator_token,
         other_runs=chosen.other_runs,
         read_folder=(lambda run: None) if options.run_directory is None else WatchedFolder(options.run_directory),
-        camera=_camera(options) if options.camera else None,
+        camera=_playing(options, "camera_process", *values),
+        match=_playing(options, "match_process"),
         takes_clients=options.takes_clients,
         announce=_announce(options.operator_token) if options.for_a_person else None,
     )

@@ -193,12 +193,12 @@ def checked_action(
     for name, space in spaces.actions.items():
         values = np.array(action[name], np.float64)
         if values.shape != (space.size,):
-            raise ValueError(f"{name} of the action has {values.size} numbers, but needs {space.size}")
+            raise ValueError(f"{name} has {values.size} numbers, but needs {space.size}")
         checked[name] = values.astype(space.dtype)
         if isinstance(space, DiscreteSpace):
             counts = np.array(space.counts)
             if (values != np.floor(values)).any() or (values < 0).any() or (values >= counts).any():
-                raise ValueError(f"{name} of the action must be whole numbers within {space}")
+                raise ValueError(f"{name} must be whole numbers from 0, below {', '.join(map(str, counts))}")
             first = np.cumsum(counts) - counts
             if name in masks and not masks[name][first + checked[name]].all():
                 raise ValueError("this move is not legal now: choose another")
@@ -206,7 +206,7 @@ def checked_action(
             low = np.array([-np.inf if bound is None else bound for bound in space.low])
             high = np.array([np.inf if bound is None else bound for bound in space.high])
             if not (np.isfinite(values) & (values >= low) & (values <= high)).all():
-                raise ValueError(f"{name} of the action must be numbers within {space}")
+                raise ValueError(f"{name} must be numbers within {space}")
     return checked
 
 

@@ -117,7 +117,7 @@ def _add_page(options: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of an operator's certificate, with which the page reads the status (with --tls)",
     )
-    options.add_argument("--no-camera", action="store_true", help="play no episodes for the page")
+    options.add_argument("--no-camera", action="store_true", help="play no episodes for the page, and no matches")
     options.add_argument(
         "--run-dir",
         type=Path,

@@ -17,6 +17,7 @@ const connection = new Connection({
     learning.forgetOthers();
     orders.offer(hello.orders, byId("token").value);
     summary.takesClients = hello.clients;
+    summary.playsMatches = hello.matches;
     camera.offer(hello.camera);
   },
   message(message) {

@@ -28,6 +28,7 @@ export class Summary {
   #tiles = new Map();
 
   takesClients = false; // whether /play may take part
+  playsMatches = false; // whether persons may play against the policy
 
   constructor(metrics) {
     this.metrics = metrics;
@@ -46,6 +47,7 @@ export class Summary {
     setText(byId("what"), `${status.environment}, ${status.algorithm}`);
     const plays = /^CartPole-v[01]$/.test(status.environment) && !OVER.has(state);
     byId("play").hidden = !plays || !this.takesClients;
+    byId("match").hidden = status.agent_steps === null || !this.playsMatches; // null: no game with several agents
     this.#progress(status);
     setText(byId("bottleneck"), state === "running" ? status.bottleneck : "");
     this.tiles();

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from daedalus.gateway.places import Places
+from daedalus.gateway.watching.matches import Matches
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import ActorStatus, Event, EventsPage, MetricsReport, Order, RunStatus
 
@@ -163,6 +164,7 @@ class PageData:
         self,
         other_runs: Callable[[], list[OtherRun]] = lambda: [],
         camera: Camera | None = None,
+        matches: Matches | None = None,
         *,
         takes_clients: bool = True,
     ) -> None:
@@ -171,9 +173,10 @@ class PageData:
         Args:
           other_runs: reads the runs to compare with; it may take long.
           camera: shows episodes; None: there is no camera.
+          matches: lets persons play against the policy; None: nobody can.
           takes_clients: whether the gateway has clients too; otherwise it serves its page only.
         """
-        self.other_runs, self.camera, self.takes_clients = other_runs, camera, takes_clients
+        self.other_runs, self.camera, self.matches, self.takes_clients = other_runs, camera, matches, takes_clients
         self.seen = Observation()
         self.give_order: GiveOrder = _nobody
         self.on_watch: Callable[[bool], None] = lambda watched: None  # receives whether anybody watches

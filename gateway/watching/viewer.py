@@ -11,6 +11,7 @@ from daedalus.gateway.channel import channel_of
 from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.security import OPERATOR, Guard, RateLimit
 from daedalus.gateway.watching import page_data
+from daedalus.gateway.watching.matches import BeginMatch, Matches, MatchOrder, PlayMove, new_orders
 from daedalus.gateway.watching.page_data import Observation, PageData
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import Order
@@ -37,12 +38,16 @@ class ViewerCamera(NamedTuple):
     on: bool
 
 
-ViewerMessage = ViewerHello | ViewerOrder | ViewerCamera
+ViewerMessage = ViewerHello | ViewerOrder | ViewerCamera | MatchOrder
 _FIELDS: dict[str, set[str]] = {
     "hello": {"type", "token"},
     "order": {"type", "order", "token"},
     "camera": {"type", "on"},
+    "match": {"type", "agent", "sampled"},
+    "move": {"type", "turn", "action"},
 }
+_MOST_NUMBERS = 1024  # of a move
+_LARGEST = 1e9
 
 
 def read_message(data: str | bytes | None) -> ViewerMessage:
@@ -59,8 +64,20 @@ def read_message(data: str | bytes | None) -> ViewerMessage:
             return ViewerOrder(chosen, token)
         case {"type": "camera", "on": bool(on)}:
             return ViewerCamera(on)
+        case {"type": "match", "agent": str(agent), "sampled": bool(sampled)}:
+            return BeginMatch(agent, sampled)
+        case {"type": "move", "turn": int(turn), "action": dict(action)} if _are_numbers(action):
+            return PlayMove(turn, action)
         case _:
             raise ClientError("malformed", f"{kind} has a field of a wrong type")
+
+
+def _are_numbers(action: dict[str, Any]) -> bool:
+    """Return whether an action has a list of finite numbers by component."""
+    lists = list(action.values())
+    return all(isinstance(each, list) and len(each) <= _MOST_NUMBERS for each in lists) and all(
+        type(value) in (int, float) and abs(value) <= _LARGEST for each in lists for value in each
+    )
 
 
 def _decoded(data: str | bytes | None) -> dict[str, Any]:
@@ -93,6 +110,10 @@ class ViewerConnection:
         self._rate = RateLimit(_RATE, _BURST)
         self._sent: Observation | None = None
         self._camera: asyncio.Task[None] | None = None
+        self._match: asyncio.Task[None] | None = None
+        self._orders = new_orders()  # for the match
+        self._owner = ""  # of the page's places
+        self._telling: asyncio.Task[None] | None = None  # why a match ended
         self._task: asyncio.Task[Any] | None = None
         self._reads_folder = False
         self._end: ClientError | None = None  # why the gateway ends the connection
@@ -108,7 +129,8 @@ class ViewerConnection:
             is_operator = owner.startswith(OPERATOR)
             self._reads_folder = bool(owner)  # without a token: whoever reaches the gateway; a run directory is private
             try:
-                with self._data.places.take(owner or self._channel.peer, self.end, is_operator=is_operator):
+                self._owner = owner or self._channel.peer
+                with self._data.places.take(self._owner, self.end, is_operator=is_operator):
                     self._channel.settle(True)
                     self._data.on_watch(True)
                     await self._converse()
@@ -143,14 +165,15 @@ class ViewerConnection:
 
     async def _converse(self) -> None:
         data = self._data
-        offers = {"orders": self._guard.takes_orders, "camera": data.camera is not None, "clients": data.takes_clients}
+        offers = {"orders": self._guard.takes_orders, "clients": data.takes_clients}
+        offers |= {"camera": data.camera is not None, "matches": data.matches is not None}
         await self._send({"type": "hello", **offers})
         showing = asyncio.create_task(self._show())
         data.begin(showing)
         try:
             await self._obey()
         finally:
-            for task in (showing, self._camera):
+            for task in (showing, self._camera, self._match):
                 if task is not None:
                     task.cancel()
 
@@ -205,6 +228,32 @@ class ViewerConnection:
                 async for frame in frames:
                     await self._send_event({"type": "websocket.send", "bytes": frame})
 
+    def _begin_match(self) -> None:
+        """Take a place among those who play. Raises ClientError if there is none."""
+        matches = self._data.matches
+        if matches is None:
+            raise ClientError("refused", "this gateway plays no matches: it was started with --no-camera")
+        place = contextlib.ExitStack()
+        place.enter_context(matches.places.take(self._owner, self._end_match))
+        self._orders = new_orders()
+        self._match = asyncio.create_task(self._play(matches, self._orders))
+        self._match.add_done_callback(lambda _: place.close())
+
+    def _end_match(self, reason: ClientError) -> None:
+        """End the match: another person needs its place."""
+        if self._match is not None and self._match.cancel():
+            self._telling = asyncio.create_task(self._tell(reason))
+
+    async def _tell(self, reason: ClientError) -> None:
+        with contextlib.suppress(OSError):  # the page is closed
+            await self._send({"type": "refused", "reason": reason.reason})
+
+    async def _play(self, matches: Matches, orders: "asyncio.Queue[MatchOrder]") -> None:
+        with contextlib.suppress(OSError):  # the page is closed
+            async with contextlib.aclosing(matches.play(orders)) as frames:
+                async for frame in frames:
+                    await self._send_event({"type": "websocket.send", "bytes": frame})
+
     async def _finish(self, error: ClientError) -> None:
         """Say why the connection ends, and close it."""
         self._channel.settle(False)
@@ -253,6 +302,14 @@ class ViewerConnection:
                 self._camera = None
                 if on and self._data.camera is not None:
                     self._camera = asyncio.create_task(self._show_camera())
+            case BeginMatch() | PlayMove():
+                if self._match is None or self._match.done():
+                    if isinstance(message, PlayMove):
+                        raise ClientError("out_of_turn", "there is no match: begin one")
+                    self._begin_match()
+                if self._orders.full():
+                    raise ClientError("unavailable", "the moves before this one are not played yet: wait for them")
+                self._orders.put_nowait(message)
             case ViewerHello():
                 raise ClientError("out_of_turn", "a connection has one hello")
 

@@ -172,6 +172,11 @@ class League:
 
     # ------------------------------------------------------------------------------------------------- results
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether the game has opponents: then the mean return says little, for what one side wins the other loses."""
+        return self._began
+
     def violation(self, matches: Matches) -> str:
         """Return why matches cannot have been played in this league, or an empty string."""
         for each in matches.counts:

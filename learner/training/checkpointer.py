@@ -120,7 +120,9 @@ class Checkpointer:
 
     def keep(self, evaluated: Evaluated) -> None:
         """Keep the checkpoint of an evaluation if it is among the best, and log the result."""
-        self.add(lambda: _logger.info("%s", evaluated.keep()))
+        league = self._context.league
+        plays_itself = league is not None and league.has_begun
+        self.add(lambda: _logger.info("%s", evaluated.text if plays_itself else evaluated.keep()))
 
     def wait(self, saving: Saving, beat: Callable[[], None], *, patient: bool = True) -> bool:
         """Wait until a checkpoint is written, and return whether it is saved. A slow disk ends the wait.
@@ -158,7 +160,12 @@ class Checkpointer:
         self._events.add("checkpoint", text, level=logging.ERROR)
 
     def _training_score(self) -> TrainingScore | None:
-        """Return the mean return of the newest training episodes, if there are enough of them and nobody evaluates."""
+        """Return the mean return of the newest training episodes, if there are enough of them and nobody evaluates.
+
+        None where the policy plays itself: its newest version counts as the best.
+        """
+        if self._context.league is not None and self._context.league.has_begun:
+            return None
         counters = self._context.counters
         mean, episodes = counters.episode_return_mean, counters.target_episodes
         silence = max(_EVALUATOR_SECONDS, 2.0 * (self._spec.evaluation.seconds or 0.0))

@@ -23,8 +23,9 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
 from daedalus.gateway.learner_link import NewestPolicy
-from daedalus.gateway.watching import camera as camera_module
-from daedalus.gateway.watching.camera import CameraProcess, frame
+from daedalus.gateway.watching import playing_process
+from daedalus.gateway.watching.camera import CameraProcess
+from daedalus.gateway.watching.playing_process import PolicySource, frame
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.messages import Snapshot, Welcome
@@ -38,8 +39,8 @@ STATE = np.zeros((3, 0), np.float32)
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for the end of a process as long as a busy machine may take."""
-    monkeypatch.setattr(camera_module, "_END_SECONDS", LIMIT)
-    monkeypatch.setattr(camera_module, "_KILLED_SECONDS", LIMIT)
+    monkeypatch.setattr(playing_process, "_END_SECONDS", LIMIT)
+    monkeypatch.setattr(playing_process, "_KILLED_SECONDS", LIMIT)
 
 
 def weights() -> dict[str, np.ndarray]:
@@ -167,9 +168,8 @@ def facts_of(frame: bytes) -> dict[str, Any]:
 
 def test_the_process_runs_while_somebody_watches_only() -> None:
     async def watch() -> None:
-        camera = CameraProcess(COMMAND)
         newest: list[NewestPolicy | None] = [None]
-        camera.newest_policy = lambda: newest[0]
+        camera = CameraProcess(COMMAND, PolicySource(lambda: newest[0]))
         frames = camera.frames()
         async with asyncio.timeout(LIMIT):
             assert "no policy yet" in facts_of(await anext(frames))["error"]
@@ -216,8 +216,7 @@ def test_the_page_is_told_why_there_is_no_picture() -> None:
     newest = policy(spec)
 
     async def watch() -> str:
-        camera = CameraProcess(COMMAND)
-        camera.newest_policy = lambda: newest
+        camera = CameraProcess(COMMAND, PolicySource(lambda: newest))
         frames = camera.frames()
         async with asyncio.timeout(LIMIT):
             facts = facts_of(await anext(frames))
@@ -235,8 +234,7 @@ ONE = "import struct, sys\nsys.stdout.buffer.write(struct.pack('<I', 4) + bytes(
 async def watched_for_a_frame(program: str) -> CameraProcess:
     """Return the camera of a Python program that somebody watched until its first frame."""
     newest = policy()
-    camera = CameraProcess((sys.executable, "-c", program))
-    camera.newest_policy = lambda: newest
+    camera = CameraProcess((sys.executable, "-c", program), PolicySource(lambda: newest))
     frames = camera.frames()
     async with asyncio.timeout(LIMIT):
         await anext(frames)

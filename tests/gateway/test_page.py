@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import Visit, chromium
+from browser import AXE, Visit, chromium
 from certificates import make_certificates
 from gateways import RunningGateway
 from league_statuses import LEAGUE
@@ -182,6 +182,42 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     page.wait_for_selector("#notices:has-text('The gateway has ended, too')")
     assert page.locator("#state").get_attribute("data-state") == "stopped"
     assert "Continue it with: daedalus resume run" in text_of(page, "#notices")
+
+
+def test_a_person_plays_tic_tac_toe_against_the_newest_policy(tmp_path: Path, browser: Any, visit: Open) -> None:
+    game = ("--env", "pettingzoo.classic.tictactoe_v3", "--env-steps", 10**9)
+    with starting(tmp_path) as start:
+        watched = Run(start("train", *game, "--watch", "--run-dir", "run", "--actors", 1))
+        visited = visit(watched.address)
+        page, visited.loses_gateway = enter(visited.page, watched.token), True
+        page.get_by_role("link", name="Play against the policy").click()
+        enter(page, watched.token)
+        page.get_by_role("button", name="Begin a match").click()
+        for agent in ("player_1", "player_2"):
+            wait_for(page, f"/Your turn, {agent}/.test(document.querySelector('#status').textContent)")
+            assert page.locator("#board button").count() == 9
+            played = 0
+            while page.locator("#board [aria-disabled=false]").count():
+                cell = page.locator("#board [aria-disabled=false]").first
+                if played:
+                    cell.click()
+                else:  # by the keyboard alone
+                    cell.focus()
+                    page.keyboard.press("Enter")
+                played += 1
+                mine = f"document.querySelectorAll('[data-mark=you]').length === {played}"
+                wait_for(page, mine)
+                assert page.locator("#board [aria-label*=', you']").count() == played
+            counts = [page.locator(f"[data-mark={owner}]").count() for owner in ("you", "policy")]
+            assert counts[0] - counts[1] in ((0, 1) if agent == "player_1" else (0, -1))
+            outcome = re.search("(You won|You lost|A draw): your return is (-?1|0), that of", text_of(page, "#status"))
+            assert outcome, text_of(page, "#status")
+            assert {"1": "You won", "-1": "You lost", "0": "A draw"}[outcome[2]] == outcome[1]
+            if AXE.exists():
+                assert visited.violations() == []
+            page.locator("#agent").select_option("player_2")
+            page.get_by_role("button", name="Play again").click()
+        assert watched.process.process.poll() is None
 
 
 # --------------------------------------------------------------------------------------- runs made for the page
@@ -407,7 +443,7 @@ def test_page_is_accessible_and_fits(gateway: RunningGateway, visit: Open, schem
     event = Event(time="2026-11-22T13:16:45.123Z", kind="left", actor="wing-3", text="no longer connected", count=1)
     status = run_status(actors, problems=("no update for 61 s",), league=LEAGUE)
     show(gateway, status, rows, events=(event,), folder=FOLDER)
-    for path, selector in (("", "#return .line"), ("play", "#status")):
+    for path, selector in (("", "#return .line"), ("play", "#status"), ("match", "#status")):
         options = {"color_scheme": scheme, "viewport": {"width": width, "height": 800}}
         one = visit(f"http://127.0.0.1:{gateway.port}/{path}", **options)
         one.page.wait_for_selector(selector)

@@ -102,7 +102,13 @@ def _lowered(headers: Message) -> dict[str, str]:
 
 def test_a_page_that_is_opened_before_there_is_a_learner_says_so(watch: Watch) -> None:
     viewer = watch()
-    assert viewer.receive("hello") == {"type": "hello", "orders": True, "camera": False, "clients": True}
+    assert viewer.receive("hello") == {
+        "type": "hello",
+        "orders": True,
+        "camera": False,
+        "clients": True,
+        "matches": False,
+    }
     assert viewer.receive("run") == {"type": "run", "state": "connecting", "reason": "", "ends": [], "status": None}
     # A page that was connected before may still show the actors and curves of another run.
     assert viewer.receive("actors")["rows"] == []
