@@ -233,6 +233,7 @@ def test_no_result_is_lost_and_plans_have_players_of_the_league_only(
     assert sum(each.weight for each in rating) == pytest.approx(1.0, abs=0.1)
 
 
+@given(st.lists(st.integers(1, 50), min_size=1, max_size=80), st.integers(1, 12))
 def test_thinning_keeps_the_first_and_the_newest(steps: list[int], most: int) -> None:
     kept: list[KeptVersion] = []
     for number, _ in enumerate(steps):
