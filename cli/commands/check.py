@@ -94,7 +94,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
     chosen = report = _report(check)
     processes = ""
     if choice.env is not None:
-        defaults = default_settings(report.spaces, [*environment.leave_out, *report.constant_texts])
+        defaults = default_settings(report.spaces, [*environment.leave_out, *report.constant_texts], report.seats)
         defaults, processes = with_measured_processes(choice.spec, defaults, report)
         spec = choice.spec(defaults)
         if spec.environment != environment and report.spaces is not None:
