@@ -316,21 +316,20 @@ class Ratings:
 
     def state(self) -> LeagueState:
         """Return everything that a checkpoint keeps."""
-        return LeagueState(
-            players=tuple(_rated(player, self._skills[player]) for player in self.players),
-            retired=tuple(_rated(player, skill) for player, skill in self._retired.items()),
-            scores=tuple(self._scores()),
-        )
+        status = self.status()
+        retired = tuple(_rated(player, skill) for player, skill in self._retired.items())
+        return LeagueState(players=status.players, retired=retired, scores=status.scores)
 
     def status(self) -> LeagueStatus:
         """Return the ratings and results for people."""
-        players = tuple(_rated(player, self._skills[player]) for player in self.players)
-        return LeagueStatus(players=players, scores=tuple(self._scores()))
-
-    def _scores(self) -> Iterator[Score]:
-        for first, second in sorted(self._results, key=lambda pair: (_order(pair[0]), _order(pair[1]))):
-            results = self._results[first, second]
-            yield Score(first=first, second=second, wins=results.wins, draws=results.draws, losses=results.losses)
+        pairs = sorted(self._results.items(), key=lambda item: (_order(item[0][0]), _order(item[0][1])))
+        return LeagueStatus(
+            players=tuple(_rated(player, self._skills[player]) for player in self.players),
+            scores=tuple(
+                Score(first=first, second=second, wins=results.wins, draws=results.draws, losses=results.losses)
+                for (first, second), results in pairs
+            ),
+        )
 
 
 def _rated(player: str, skill: _Skill) -> RatedPlayer:

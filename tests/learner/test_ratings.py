@@ -121,7 +121,10 @@ def test_rating_matches_are_those_that_tell_most() -> None:
     plan = {(each.first, each.second): each.weight for each in ratings.rating_plan(["random"])}
     others = {pair: weight for pair, weight in plan.items() if pair != (NEWEST, "random")}
     assert plan[NEWEST, "random"] >= 0.5  # people look at it
-    assert all("v11" in pair or NEWEST in pair or "random" in pair for pair in sorted(others, key=others.get)[-3:])
+    assert all(
+        "v11" in pair or NEWEST in pair or "random" in pair
+        for pair in sorted(others, key=lambda pair: others[pair])[-3:]
+    )
     unequal = Ratings(["random", "a:Strong"])
     played(unequal, "a:Strong", "random", 380, 0, 20)
     unequal.keep(0)
