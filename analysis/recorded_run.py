@@ -325,6 +325,23 @@ def _numbers(path: Path, line: int, row: Sequence[str], cells: int) -> list[floa
         raise RunDataError(f"{path} is damaged: line {line}: {error}") from None
 
 
+class RecordedGames(BaseModel, allow_inf_nan=False, frozen=True):
+    """Games of the policy against an opponent, from every side in turn."""
+
+    games: int = Field(ge=1)
+    wins: int = Field(ge=0)
+    draws: int = Field(ge=0)
+    losses: int = Field(ge=0)
+    win_interval: tuple[float, float]  # of the share of games that are won, 95 %
+
+
+class RecordedMatches(BaseModel, frozen=True):
+    """Results of the games of an evaluation."""
+
+    opponent: str
+    total: RecordedGames
+
+
 class RecordedEvaluation(BaseModel, allow_inf_nan=False, frozen=True):
     """Result of `daedalus evaluate --json`. Without the returns of the episodes in runs of earlier releases."""
 
@@ -342,6 +359,7 @@ class RecordedEvaluation(BaseModel, allow_inf_nan=False, frozen=True):
     return_max: float
     length_mean: float
     returns: tuple[float, ...] = ()
+    matches: RecordedMatches | None = None  # of a game with opponents
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

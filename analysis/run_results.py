@@ -137,8 +137,15 @@ def _share(record: RunRecord, rejected: int, causes: str) -> str:
 
 def statistics_rows(evaluation: RecordedEvaluation, statistics: EpisodeStatistics) -> list[tuple[str, str]]:
     """Return the statistics of an evaluation as names and values."""
-    mean = statistics.mean
-    rows = [
+    mean, rows = statistics.mean, list[tuple[str, str]]()
+    if evaluation.matches is not None:
+        total, (low, high) = evaluation.matches.total, evaluation.matches.total.win_interval
+        won = f"{total.wins:,} of {total.games:,}, drawn {total.draws:,}, lost {total.losses:,}"
+        rows += [
+            (f"games won against {evaluation.matches.opponent}", won),
+            ("95 % interval of the share of wins", f"{low:.1%} to {high:.1%}"),
+        ]
+    rows += [
         ("mean", written(mean.value)),
         ("95 % interval of the mean", interval_text(mean.low, mean.high)),
         ("standard deviation", written(statistics.std)),

@@ -41,6 +41,8 @@ def reports(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> list[Path
     record(folder / "acrobot", preset="acrobot")
     players = (RatedPlayer(player=HOSTILE, rating=-1.0, deviation=1.0), *LEAGUE.players)
     game = record(folder / "game", league=LEAGUE.model_copy(update={"players": players, "left_out": 5}))
+    total = {"games": 100, "wins": 38, "draws": 18, "losses": 44, "win_interval": [0.291, 0.478]}
+    evaluated(game, matches={"opponent": "random", "total": total})
     assert report([str(rich)]) == report([str(poor)]) == report([str(game)]) == 0
     assert report([str(folder), "--output", str(folder / "report.html")]) == 0
     return [rich / "report.html", poor / "report.html", folder / "report.html", game / "report.html"]
@@ -98,6 +100,8 @@ def test_a_game_with_opponents_has_ratings_and_a_matrix(reports: list[Path], ope
     assert (cell.inner_text(), cell.get_attribute("class")) == ("75", "wins")
     assert cell.get_attribute("title") == "v0 against newest: 75% of 40 matches (30 won, 0 drawn, 10 lost)"
     assert page.locator("figcaption", has_text="win rate against random").count() == 1
+    row = page.locator("tr", has=page.locator("th:text-is('games won against random')"))
+    assert row.locator("td").inner_text() == "38 of 100, drawn 18, lost 44"
 
 
 @pytest.mark.parametrize("index", range(4))
