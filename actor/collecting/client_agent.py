@@ -7,9 +7,8 @@ from typing import Any
 import gymnasium
 
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
-from daedalus.actor.collecting.client_rows import ClientRows, finished_copy
+from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.precision import Precision
 
 _logger = logging.getLogger(__name__)
@@ -114,10 +113,10 @@ class ClientAgent:
             raise ValueError("the episode ended without any action: call act() first")
         self._rows.end_episode(observation, terminated=terminated)
 
-    def keep(self, writer: RolloutWriter) -> None:
+    def keep(self, rows: ClientRows) -> None:
         """Hand over a full rollout. Called by the agent's rows."""
         assert self._loaded is not None
-        self._exchange.keep(self._index, finished_copy(writer, self._loaded.version))
+        self._exchange.keep(self._index, rows.finished_copy(self._loaded.version))
 
     def _switch_policy(self) -> None:
         """Continue with a policy that has begun meanwhile; drop the unfinished rollout of the previous one."""

@@ -12,7 +12,6 @@ from daedalus.actor.collecting.client_agent import ClientAgent
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
 from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
@@ -91,7 +90,7 @@ class ClientCollector:
         assert self._transforms is not None
         assert self._program is not None
 
-        def keep(full: RolloutWriter) -> None:
+        def keep(full: ClientRows) -> None:
             agent.keep(full)
             self.on_rollout()
 
