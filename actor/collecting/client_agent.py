@@ -8,6 +8,7 @@ import gymnasium
 
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
 from daedalus.actor.collecting.client_rows import ClientRows
+from daedalus.actor.collecting.client_seats import MatchSeat
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.precision import Precision
 
@@ -18,6 +19,9 @@ _MOST_WATCHED = 1000  # observations
 
 class ClientAgent:
     """One agent, with episodes and rollouts of its own. For the caller's thread.
+
+    Of a match whose agents act in turns, call `act` at the turn of this agent only; rewards that come between its turns
+    belong to its last action.
 
     A rollout is played with one policy version. In a run whose actors wait for each update, the agent goes on with the
     last policy meanwhile, and those rows are not written.
@@ -35,6 +39,7 @@ class ClientAgent:
           check: raises what has ended the client's thread.
         """
         self._index, self._exchange, self._guard, self._check = index, exchange, guard, check
+        self.seat: MatchSeat | None = None  # in the match that the loop hosts
         self._rows: ClientRows | None = None
         self._loaded: LoadedPolicy | None = None  # that acts
         self.actions = self.overridden_actions = self.safe_actions = 0

@@ -38,6 +38,7 @@ def side_by_side(rollouts: Sequence[Rollout]) -> Rollout:
         episode_returns=np.concatenate([each.episode_returns for each in rollouts]),
         episode_lengths=np.concatenate([each.episode_lengths for each in rollouts]),
         overridden=np.concatenate(overridden, axis=1) if any(each.any() for each in overridden) else None,
+        game_steps=None if first.game_steps is None else sum(each.env_steps for each in rollouts),
     )
 
 
