@@ -420,5 +420,5 @@ def _status(outcome: Outcome, spec: RunSpec, stopped: int, unsaved: int) -> int:
         return unsaved
     if not outcome.finished:
         return ORDERED if outcome.stopped_by and stopped else stopped
-    wanted = spec.training.target_return is not None and spec.training.stop_when_solved
+    wanted = bool(spec.target) and spec.training.stop_when_solved
     return NOT_REACHED if wanted and not outcome.solved else REACHED

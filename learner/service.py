@@ -97,9 +97,14 @@ class LearnerService:
         rollouts are too short for masked actions.
         """
         self._heartbeat.start()
+        league = self._context.league
         try:
+            if league is not None:
+                league.load_opponents()
             self._server.open()
             continue_records(self._context)
+            if league is not None:
+                league.open(self._context.start_version)
             from daedalus.learner.training.learner import Learner
 
             if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):
@@ -108,6 +113,8 @@ class LearnerService:
             assert spaces is not None
             spec = self._context.spec
             check_rollout_length(spec, spaces)
+            if league is not None:
+                league.check_opponents(spaces)
             learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
             self._beginning.load_into(learner, spec, self._context.progress)
             checkpointer, loop = self._training_of(learner)

@@ -142,7 +142,13 @@ class TrainingLoop:
 
     def _reaches_target(self) -> bool:
         """Return whether the target is reached for the first time, and new episodes confirm it if they are played."""
-        if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._context.spec):
+        if self._counters.seconds_to_target is not None:
+            return False
+        league = self._context.league
+        if league is not None and league.reaches_target:
+            self._context.events.add("target", f"target reached: {self._context.spec.target}")
+            return True
+        if not self._counters.is_solved(self._context.spec):
             return False
         return self._confirmation is None or self._confirmation.confirm(self._learner, self._checkpointer)
 
@@ -151,6 +157,8 @@ class TrainingLoop:
         learner, rollouts = self._learner, self._server.rollouts
         env_steps, progress = self._counters.env_steps, self._context.progress
         batch = rollouts.take_batch(learner.policy_version)
+        if self._context.league is not None:  # before the update: the first version is the policy of the beginning
+            self._context.league.advance(learner, env_steps, self._checkpointer.add)
         self._health.left_out = rollouts.left_out
         if not batch:
             return

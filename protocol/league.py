@@ -12,6 +12,7 @@ from daedalus.protocol.models import NaturalInt, Specification
 
 NEWEST = "newest"  # the policy that learns, at whatever version an actor has it
 RANDOM = "random"  # legal actions, all equally probable
+DEFAULT_PAST_SHARE = 0.2  # of the matches of a game with opponents, against past versions
 MAX_PLAYER = 200  # characters
 MAX_SIDES = 1024
 _MAX_PLAYERS = 512
@@ -25,6 +26,11 @@ Purpose = Literal["training", "rating"]
 def version_name(policy_version: int) -> str:
     """Return the name of the player that is a kept version of the policy."""
     return f"v{policy_version}"
+
+
+def is_bot(player: str) -> bool:
+    """Return whether a fixed opponent is code: the others are policies of other runs."""
+    return player == RANDOM or ":" in player
 
 
 class MatchCount(Specification):

@@ -24,7 +24,7 @@ from daedalus.protocol.models import (
     has_field,
 )
 from daedalus.protocol.spaces import ComponentName
-from daedalus.protocol.texts import bounded_text
+from daedalus.protocol.texts import bounded_text, exact_number
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast", "pettingzoo"]
 GAME_PACKAGES = ("pettingzoo", "mpe2")  # whose modules are games with several agents
@@ -444,7 +444,25 @@ class LeagueSpec(Specification):
     rating_share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.01
     """Share of the matches that are only played to rate the players, and not learned from."""
     rating_actions: Literal["sampled", "greedy"] = "sampled"
-    """Actions of the policies in rating matches."""
+    """Actions of the policies in rating matches. With `greedy` only these matches count for ratings and scores; with
+    `sampled` those of training do, too."""
+    target_opponent: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    """The target is reached when the newest policy surely has `target_win_rate` against this one of `opponents`: the
+    lower end of the 95 % interval over about the last 200 matches. In place of `training.target_return`."""
+    target_win_rate: Annotated[float, Field(gt=0.0, le=0.98)] = 0.9
+    """Share of matches that are won; a draw is half. So few matches cannot prove more than 0.98."""
+    target_rating: float | None = None
+    """The target is reached when the rating of the newest policy is two deviations above this value. In place of
+    `training.target_return`."""
+
+    @model_validator(mode="after")
+    def _has_one_target(self) -> "LeagueSpec":
+        if self.target_opponent is not None:
+            if self.target_opponent not in self.opponents:
+                raise ValueError(f"league.target_opponent {self.target_opponent!r} is not one of league.opponents")
+            if self.target_rating is not None:
+                raise ValueError("league.target_opponent and league.target_rating are both set: unset one of them")
+        return self
 
     @property
     def user_modules(self) -> dict[str, str]:
@@ -588,6 +606,9 @@ class RunSpec(Specification):
             )
         if (self.league.past_share or 0.0) + sum(self.league.opponents.values()) > 1.0:
             raise ValueError("league.past_share and the shares of league.opponents are more than 1 together")
+        for name in ("target_opponent", "target_rating"):
+            if getattr(self.league, name) is not None and self.training.target_return is not None:
+                raise ValueError(f"training.target_return and league.{name} are both set: unset one of them")
         return self
 
     @model_validator(mode="after")
@@ -635,6 +656,17 @@ class RunSpec(Specification):
         )
         changed = (*changed_fields(spec), *changed_fields(learning, "learning."))
         return spec.model_copy(update={"learning": learning.model_dump(mode="json"), "changed": changed})
+
+    @property
+    def target(self) -> str:
+        """What the run is to reach, in words; empty if nothing."""
+        league = self.league
+        if league.target_opponent is not None:
+            return f"win rate {exact_number(league.target_win_rate)} against {league.target_opponent}"
+        if league.target_rating is not None:
+            return f"rating {exact_number(league.target_rating)}"
+        target = self.training.target_return
+        return "" if target is None else f"mean return {exact_number(target)}"
 
     @property
     def user_modules(self) -> dict[str, str]:

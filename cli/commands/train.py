@@ -54,7 +54,7 @@ from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
-from daedalus.protocol.texts import exact_number, short_number
+from daedalus.protocol.texts import short_number
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
 
 _TRAIN = """\
@@ -316,16 +316,16 @@ def _left_report(directory: Path) -> str:
 
 def report(run: LocalRun, summary: dict[str, Any]) -> str:
     """Return the result of a run from its summary.json, with the evaluation."""
-    target = run.spec.training.target_return
+    target = run.spec.target
     skipped = f" ({summary['updates_skipped']:,} skipped)" if summary.get("updates_skipped") else ""
     updates = f"{summary['updates']:,} updates{skipped}"
     if summary["solved"]:
         trained = (
-            f"solved: mean return {exact_number(target)} reached after {summary['seconds_to_target']:.1f} s; "
+            f"solved: {target} reached after {summary['seconds_to_target']:.1f} s; "
             f"{summary['env_steps']:,} env_steps, {updates} in all"
         )
     else:
-        goal = "" if target is None else f" (the target {exact_number(target)} was not reached)"
+        goal = f" (the target, {target}, was not reached)" if target else ""
         trained = f"done: {summary['env_steps']:,} env_steps, {updates}{goal}"
     evaluation = summary["evaluation"]
     evaluated = (

@@ -201,6 +201,7 @@ class RunReporter:
             bottleneck=self._bottleneck,
             learning_share=rates.learning_share,
             decoding_share=rates.decoding_share,
+            league=None if context.league is None else context.league.status(),
         )
 
     def summary(self, *, finished: bool, now: float, stopped_by: str = "") -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
+from daedalus.learner.league.ratings import LeagueState
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Rollout, Upload
 
@@ -78,6 +79,8 @@ class _State(BaseModel, strict=True):
 def check_counters(state: Any) -> dict[str, Any]:
     """Return counters that were read, if they can be restored. Raises KeyError or ValueError if they cannot."""
     _State.model_validate(state)
+    if state.get("league") is not None:
+        LeagueState.model_validate(state["league"])
     _COUNTS.validate_python({name: state[name] for name in _SAVED if name in state or name == "env_steps"})
     return state
 
@@ -181,13 +184,13 @@ class RunCounters:
         self.lengths.clear()
         self.best_evaluation = None
 
-    def forget_target(self, before: TrainingSpec, training: TrainingSpec) -> None:
+    def forget_target(self, before: RunSpec, spec: RunSpec) -> None:
         """Forget when the target was reached, where it has to be reached again under the settings of a resumed run.
 
         Only a target at which training does not end, and which is the same as before, stays reached.
         """
-        same = (before.target_return, before.target_episodes) == (training.target_return, training.target_episodes)
-        if training.stop_when_solved or not same:
+        same = (before.target, before.training.target_episodes) == (spec.target, spec.training.target_episodes)
+        if spec.training.stop_when_solved or not same:
             self.seconds_to_target = None
 
     def state(self, wall_seconds: float) -> dict[str, Any]:

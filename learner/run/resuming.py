@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daedalus.learner.league.ratings import LeagueState, Ratings
 from daedalus.learner.run.counters import RunCounters, check_counters
 from daedalus.learner.run.run_directory import SUMMARY, VERSIONS, read_json
 from daedalus.learner.run.settings import SettingsError, assign, override, run_spec
@@ -18,7 +19,6 @@ from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
-from daedalus.protocol.texts import exact_number
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -203,7 +203,7 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
 
     A learner that was killed between its last checkpoint and its summary has to be started again.
     """
-    counters = _newest_counters(directory, spec)
+    counters, league = _newest_counters(directory, spec)
     try:
         summary = read_json(directory / SUMMARY)
     except SettingsError:
@@ -211,11 +211,12 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
     if counters is None or summary.get("env_steps") != counters.env_steps:
         return None
     training = spec.training
-    solved = counters.is_solved(spec) and bool(summary.get("solved"))  # not while new episodes have to confirm it
+    # Not while new episodes have to confirm it:
+    solved = (counters.is_solved(spec) or _reached_in_league(spec, league)) and bool(summary.get("solved"))
     if solved and training.stop_when_solved:
         reason = (
-            f"the target return {exact_number(training.target_return)} was reached, and {counters.env_steps:,} "
-            "env_steps are done: train on with --set training.stop_when_solved=false, or raise training.target_return"
+            f"the target, {spec.target}, was reached, and {counters.env_steps:,} env_steps are done: train on with "
+            "--set training.stop_when_solved=false, or set a higher target"
         )
     elif counters.env_steps >= training.env_steps:
         reason = (
@@ -224,20 +225,27 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
         )
     else:
         return None
-    missed = training.target_return is not None and training.stop_when_solved and not solved
+    missed = bool(spec.target) and training.stop_when_solved and not solved
     to_evaluate = bool(summary.get("finished")) and summary.get("evaluation") is None
     return FinishedRun(reason=reason, missed=missed, to_evaluate=to_evaluate)
 
 
-def _newest_counters(directory: Path, spec: RunSpec) -> RunCounters | None:
+def _reached_in_league(spec: RunSpec, state: Any) -> bool:
+    """Return whether the league of a checkpoint has reached the target of a specification."""
+    return state is not None and Ratings(spec.league.opponents, LeagueState.model_validate(state)).reach(spec.league)
+
+
+def _newest_counters(directory: Path, spec: RunSpec) -> tuple[RunCounters | None, Any]:
+    """Return the counters of the newest checkpoint and the state of its league, or None for each."""
     for checkpoint in checkpoints(directory):
         counters = RunCounters(spec.training.target_episodes)
         try:
-            counters.restore(check_counters(SealedDirectory(checkpoint).content["counters"]))
+            saved = check_counters(SealedDirectory(checkpoint).content["counters"])
         except (DamagedError, KeyError, ValueError):
             continue  # the learner reports it
-        return counters
-    return None
+        counters.restore(saved)
+        return counters, saved.get("league")
+    return None, None
 
 
 class CheckpointMismatchError(Exception):

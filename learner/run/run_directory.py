@@ -10,6 +10,7 @@ evaluation.json  result of the final evaluation, with the return of each episode
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 report.html      a page about the run, which `daedalus train` leaves at its end
 tracker-*.json   how far each tracker has logged the run
+league/          of a game: kept versions of the policy, and the policies of other runs that are opponents
 """
 
 import itertools
@@ -31,6 +32,7 @@ from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
 from daedalus.learner.run.settings import SettingsError, as_toml, read_settings, run_spec
 from daedalus.policy.saving.regular_files import replace_text
+from daedalus.policy.saving.sealed import remove_sealed
 from daedalus.protocol import keys
 from daedalus.protocol.spec import RunSpec
 
@@ -39,6 +41,7 @@ OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
 OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
 CONFIRMATION_OUTPUT = "confirmation.log"  # of a learner's evaluator, where the launcher writes output.log
 REPORT = "report.html"
+LEAGUE = "league"  # folder of kept versions and of other runs' policies that are opponents
 TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run
 _SUPERSEDED = "superseded_by"  # in summary.json: the epoch of the newer learner
 _PACKAGES = (
@@ -172,7 +175,9 @@ def remove_failed(directory: Path) -> None:
         for file in directory.glob(pattern):
             with suppress(OSError):
                 file.unlink()
-    for folder in (directory / "checkpoints", directory):
+    for sealed in (directory / LEAGUE).glob("*"):
+        remove_sealed(sealed)
+    for folder in (directory / "checkpoints", directory / LEAGUE, directory):
         with suppress(OSError):  # not empty, or a mount point
             folder.rmdir()
 

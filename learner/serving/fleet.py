@@ -95,6 +95,7 @@ class Actor:
     uploads: int = 0  # rollouts or gradients of the newest incarnation that were received, whatever their verdict
     rows: int = 0  # env_steps that its accepted ones state
     episode_rows: int = 0  # env_steps of the episodes that they report
+    matches: int = 0  # that its rollouts report
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     busy: int = 0  # number of `busy` answers
@@ -166,7 +167,7 @@ class Actor:
         self.missed_earlier = self.missed
         self.incarnation, self.sequences = incarnation, SequenceWindow(low=next_sequence)
         self.incarnations += 1
-        self.uploads, self.rows, self.episode_rows = next_sequence, 0, 0
+        self.uploads, self.rows, self.episode_rows, self.matches = next_sequence, 0, 0, 0
         self.consecutive_unfit = self.faults = self.good_in_a_row = 0
         self.left, self.longest_silence = False, 0.0
         self.quarantined = self.drained_by = ""

@@ -32,7 +32,7 @@ from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
 from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.uploads import Upload
+from daedalus.protocol.uploads import Rollout, Upload
 from daedalus.transport.interface import Request
 
 # Senders take a request for lost that waits 30 s, and send it again.
@@ -168,7 +168,8 @@ class RolloutIntake:
         self._spec, self._lock = context.spec, context.lock
         self._fleet, self._counters, self._events = context.fleet, context.counters, context.events
         self._version = context.start_version  # rollouts of this version have a policy lag of 0
-        self._judge = RolloutJudge(context.spec, context.learner_epoch, context.fleet)
+        self._league = context.league
+        self._judge = RolloutJudge(context.spec, context.learner_epoch, context.fleet, context.league)
         self._buffer = _buffer(context.spec, self._judge)
         self._requests = RequestQueue(context.spec.service.queue_bytes, _most_requests(context.spec, live=0))
         self._named: set[str] = set()  # actors that were logged as left out
@@ -404,6 +405,8 @@ class RolloutIntake:
             self._buffer.heard(sender)
         verdict = self._judge.decide(sender, content, self._version, time.monotonic())
         self._fleet.received(sender, size)
+        if not isinstance(verdict, Rejected) or verdict.cause == "stale":
+            self._count_matches(content)
         if isinstance(verdict, Rejected):
             self._count_rejection(sender, verdict)
         else:
@@ -411,6 +414,11 @@ class RolloutIntake:
             self._counters.accepted(verdict, size)
             self._lock.notify_all()
         return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
+
+    def _count_matches(self, content: Upload | Rejected) -> None:
+        """Count the results of matches in a rollout that was received for the first time, however old its policy is."""
+        if self._league is not None and isinstance(content, Rollout) and content.matches is not None:
+            self._league.add(content.matches)
 
     def _final_answer(self, sender: str, answer: Acknowledgement) -> Acknowledgement:
         """Return the answer to a rollout, `drained` and by whom if its actor is asked to leave."""

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from daedalus.learner.league.league import League
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.upload_checks import (
     Shapes,
@@ -66,8 +67,9 @@ class Rejected:
 class RolloutJudge:
     """Judge of rollouts by the run's specification and the state of the fleet."""
 
-    def __init__(self, spec: RunSpec, learner_epoch: int, fleet: Fleet) -> None:
-        self._spec = spec
+    def __init__(self, spec: RunSpec, learner_epoch: int, fleet: Fleet, league: League | None = None) -> None:
+        """Construct the judge; `league` is that of a game, whose matches rollouts report."""
+        self._spec, self._league = spec, league
         self._epoch = learner_epoch
         self._fleet = fleet
         self._envs_per_actor = spec.collection.envs_per_actor
@@ -194,6 +196,7 @@ class RolloutJudge:
             return Rejected(verdict="rejected", cause="unfit", reason=violation)
         actor.sequences.add(identity.sequence)
         actor.uploads += 1
+        actor.matches += _matches(rollout)
         # A synchronous algorithm accepts only rollouts of the newest version.
         most = 0 if self._spec.algorithm.synchronous else self._spec.policy_lag_bound_with(len(self._fleet.live))
         if lag > most:
@@ -209,13 +212,15 @@ class RolloutJudge:
         environment in a rollout, unless its agents act in step, and lives in real time. The seats of a game play such
         rows, too, while others act less often.
         """
-        lengths = upload.episode_lengths
-        if not len(lengths):
+        lengths, matches = upload.episode_lengths, _matches(upload)
+        if not len(lengths) and not matches:
             return ""
         rows = self._spec.collection.rollout_length * min(upload.identity.sequence + 1, _LOST * (actor.uploads + 1))
         if actor.environments == 1 or self._spec.algorithm.synchronous or self._spec.environment.is_game:
             rows += int(_CLIENT_ROWS * (now - actor.joined + _BEGIN_SECONDS))
-        longest, total = int(lengths.max()), sum(lengths.tolist())
+        if actor.matches + matches > rows * (actor.environments + 1):  # one copy of the game may only rate
+            return f"it reports {matches} matches, and {actor.matches} before, but has played at most {rows} rows"
+        longest, total = int(lengths.max(initial=0)), sum(lengths.tolist())
         if longest > rows or actor.episode_rows + total > rows * actor.environments:
             return (
                 f"it reports episodes of {total} env_steps, the longest of {longest}, and {actor.episode_rows} before, "
@@ -279,11 +284,22 @@ class RolloutJudge:
         environment = self._spec.environment
         if rollout.game_steps is not None and not environment.is_game:
             return "game_steps is set, but the run plays no game with several agents"
+        if rollout.matches is not None:
+            if self._league is None:
+                return "matches is set, but the run plays no game with several agents"
+            if violation := self._league.violation(rollout.matches):
+                return violation
         if environment.reward_clip is not None:
             largest = environment.reward_clip * environment.reward_scale
             if np.abs(rollout.rewards).max() > largest * (1 + 1e-5):
                 return f"rewards has a value outside the clip range of +-{largest:g}"
         return ""
+
+
+def _matches(upload: Upload) -> int:
+    """Return the number of matches that an upload reports."""
+    counts = upload.matches.counts if isinstance(upload, Rollout) and upload.matches is not None else ()
+    return sum(each.wins + each.draws + each.losses for each in counts)
 
 
 def _number_violation(rollout: Rollout) -> str:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from daedalus.learner.league.league import League
+from daedalus.learner.league.ratings import LeagueState
 from daedalus.learner.reporting.thinning import MetricsHistory
 from daedalus.learner.run.counters import Annealing, RunCounters
 from daedalus.learner.run.run_directory import run_name
@@ -136,6 +138,7 @@ class RunContext:
     health: Health
     events: EventLog
     history: MetricsHistory
+    league: League | None  # of a game
 
     @classmethod
     def begin(
@@ -161,23 +164,27 @@ class RunContext:
         started = time.monotonic() if started is None else started
         training, counters = spec.training, RunCounters(spec.training.target_episodes)
         starts, version, annealing, other_episodes = 1, 0, Annealing(budget=training.env_steps), False
+        league_state = None
         if restored is not None:
             saved, before = restored.counters, restored.policy.spec
             starts, version, spaces = saved.get("starts", 0) + 1, restored.policy.policy_version, restored.policy.spaces
             other_episodes = before.environment.max_episode_steps != spec.environment.max_episode_steps
             counters.restore(saved)
-            counters.forget_target(before.training, training)
+            counters.forget_target(before, spec)
             if other_episodes:
                 counters.forget_returns()
                 counters.seconds_to_target = None
             annealing = Annealing(**saved.get("annealing", {"budget": before.training.env_steps}))  # not in early ones
             annealing = annealing.resumed(counters.env_steps, training.env_steps)
+            if saved.get("league") is not None:  # absent in early ones
+                league_state = LeagueState.model_validate(saved["league"])
+        epoch = new_epoch(starts)
         return cls(
             directory=directory,
             name=run_name(directory),
             spec=spec,
             starts=starts,
-            learner_epoch=new_epoch(starts),
+            learner_epoch=epoch,
             start_version=version,
             started=started,
             other_episodes=other_episodes,
@@ -190,6 +197,7 @@ class RunContext:
             health=Health(started=started, updated=started, actor_seen=started, directory=str(directory)),
             events=EventLog(),
             history=MetricsHistory(),
+            league=League(directory, spec, epoch, league_state) if spec.environment.is_game else None,
         )
 
     @property
@@ -215,4 +223,6 @@ class RunContext:
     def saved(self, now: float) -> dict[str, Any]:
         """Return the counters in the form that a checkpoint stores."""
         counters = self.counters.state(self.wall_seconds(now))
-        return {**counters, "annealing": self.annealing.model_dump(), "starts": self.starts}
+        state = None if self.league is None else self.league.state()
+        league = {} if state is None else {"league": state.model_dump(mode="json")}
+        return {**counters, "annealing": self.annealing.model_dump(), "starts": self.starts, **league}

@@ -17,7 +17,15 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import Bits, bfloat16, planes
 from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS, Limits
-from daedalus.protocol.messages import CompactSnapshot, Program, Refusal, Snapshot, SnapshotPart, SnapshotRequest
+from daedalus.protocol.messages import (
+    CompactSnapshot,
+    LeagueRequest,
+    Program,
+    Refusal,
+    Snapshot,
+    SnapshotPart,
+    SnapshotRequest,
+)
 from daedalus.transport.interface import Request, Transport, TransportError
 
 # A part waits in the router until the reader's link is free. A part larger than the router's buffer for one reader
@@ -142,28 +150,33 @@ _CLOSE_SECONDS = 0.5  # for an answer in progress; a frozen reader must not dela
 
 
 class CompactSnapshotServer:
-    """Server of SnapshotRequests for compact snapshots, from `open` to `close`."""
+    """Server of requests whose answers take time, from `open` to `close`: compact snapshots, policies of opponents."""
 
     def __init__(
-        self, learner_epoch: int, newest: Callable[[], bytes], on_answer: Callable[[SnapshotRequest, int], None]
+        self,
+        learner_epoch: int,
+        newest: Callable[[], bytes],
+        of_player: Callable[[str], bytes],
+        on_answer: Callable[[SnapshotRequest | LeagueRequest, int], None],
     ) -> None:
         """Construct the server.
 
         Args:
           learner_epoch: epoch of this learner process.
           newest: function that returns the newest encoded snapshot.
+          of_player: function that returns the answer to a request for the policy of a player of the league.
           on_answer: called with the request and the number of bytes after each answer.
         """
         self._cache = CompactSnapshotCache(learner_epoch)
-        self._newest, self._on_answer = newest, on_answer
-        self._requests: queue.SimpleQueue[tuple[Request, SnapshotRequest] | None] = queue.SimpleQueue()
+        self._newest, self._of_player, self._on_answer = newest, of_player, on_answer
+        self._requests: queue.SimpleQueue[tuple[Request, SnapshotRequest | LeagueRequest] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="compact snapshots", daemon=True)
 
     def open(self) -> None:
         """Start the thread."""
         self._thread.start()
 
-    def offer(self, request: Request, message: SnapshotRequest) -> None:
+    def offer(self, request: Request, message: SnapshotRequest | LeagueRequest) -> None:
         """Queue a request and its decoded payload, or refuse it if the queue is full. Does not block."""
         if self._requests.qsize() >= _MAX_WAITING:
             request.reply(_refusal("not_ready", "too many requests for snapshots: retry later"))
@@ -179,7 +192,10 @@ class CompactSnapshotServer:
     def _work(self) -> None:
         while (waiting := self._requests.get()) is not None:
             request, message = waiting
-            answer = self._cache.answer(message, self._newest())
+            if isinstance(message, LeagueRequest):
+                answer = self._of_player(message.player)
+            else:
+                answer = self._cache.answer(message, self._newest())
             request.reply(answer)
             self._on_answer(message, len(answer))
 
@@ -192,7 +208,8 @@ class SnapshotPublisher:
 
     def __init__(self, context: RunContext, transport: Transport) -> None:
         self._context, self._transport = context, transport
-        self._compact = CompactSnapshotServer(context.learner_epoch, self.snapshot, self._count_answer)
+        self._league = context.league
+        self._compact = CompactSnapshotServer(context.learner_epoch, self.snapshot, self._of_player, self._count_answer)
         # The answer to queries for the newest snapshot, and its version if it is a snapshot.
         self._snapshot: tuple[bytes, int | None] = (_refusal("not_ready", "the learner has no policy yet"), None)
         self._unchanged = _refusal("not_ready", "the actor holds the newest snapshot")
@@ -219,6 +236,8 @@ class SnapshotPublisher:
     def program(self, name: str) -> bytes:
         """Return the answer to a query for the program with a hash, or for the current program (`*`)."""
         if self.offered is None or name not in ("*", self.offered.hash):
+            if self._league is not None and (program := self._league.program(name)) is not None:
+                return program
             return _refusal("unknown", f"no program with hash {name[:64]!r}")
         return self._program
 
@@ -232,10 +251,12 @@ class SnapshotPublisher:
         if not request.size:
             request.reply(self.snapshot())
             return
-        message = read_request(request.payload, SNAPSHOT_REQUEST_LIMITS, SnapshotRequest)
+        message = read_request(request.payload, SNAPSHOT_REQUEST_LIMITS, SnapshotRequest, LeagueRequest)
         if isinstance(message, Refusal):
             request.reply(encode(message))
-        elif message.compact:
+        elif isinstance(message, LeagueRequest) and not message.player:
+            request.reply(self._plan(message))
+        elif isinstance(message, LeagueRequest) or message.compact:
             self._compact.offer(request, message)
         else:
             answer = self.snapshot(message.held_version)
@@ -284,12 +305,27 @@ class SnapshotPublisher:
         self._context.fleet.pushed_bytes += len(snapshot)
         self._context.counters.snapshots_published += 1
 
-    def _count_answer(self, request: SnapshotRequest, size: int) -> None:
+    def _plan(self, request: LeagueRequest) -> bytes:
+        """Return the answer to a request for whom to play."""
+        if self._league is None:
+            return _refusal("unknown", "the run plays no game with several agents")
+        return self.snapshot() if self._ended else self._league.plan(request.held_revision)
+
+    def _of_player(self, player: str) -> bytes:
+        """Return the answer to a request for the policy of a player."""
+        if self._league is None:
+            return _refusal("unknown", "the run plays no game with several agents")
+        if self._ended or self.offered is None:
+            return self.snapshot()  # why there is none
+        return self._league.snapshot(player, self.offered.hash)
+
+    def _count_answer(self, request: SnapshotRequest | LeagueRequest, size: int) -> None:
         """Count an answer to an actor. Any thread may call this method."""
         with self._context.lock:
             actor = self._context.fleet.actors.get(request.actor)
             if actor is not None:
-                actor.fetches, actor.compact_snapshots = True, request.compact
+                if isinstance(request, SnapshotRequest):
+                    actor.fetches, actor.compact_snapshots = True, request.compact
                 actor.answered_bytes += size
 
 

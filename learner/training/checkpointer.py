@@ -66,7 +66,8 @@ class Checkpointer:
         self._env_steps = context.counters.env_steps  # of the last checkpoint; at first, of the one that was restored
         self._advice = ""  # after the last error
         self._unfinished, self._counting = 0, threading.Lock()  # number of jobs
-        # Bounded by its users: one checkpoint, the last one, and the results of evaluations in progress.
+        # Bounded by its users: one checkpoint, the last one, the results of evaluations in progress, and one version of
+        # the league.
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         threading.Thread(target=self._work, name="checkpoints", daemon=True).start()  # it may never end: see above
 
@@ -114,12 +115,14 @@ class Checkpointer:
                 saving.done.set()
             on_end(saving)
 
-        self._add(save)
+        self.add(save)
         return saving
 
     def keep(self, evaluated: Evaluated) -> None:
         """Keep the checkpoint of an evaluation if it is among the best, and log the result."""
-        self._add(lambda: _logger.info("%s", evaluated.keep()))
+        league = self._context.league
+        plays_itself = league is not None and league.has_begun
+        self.add(lambda: _logger.info("%s", evaluated.text if plays_itself else evaluated.keep()))
 
     def wait(self, saving: Saving, beat: Callable[[], None], *, patient: bool = True) -> bool:
         """Wait until a checkpoint is written, and return whether it is saved. A slow disk ends the wait.
@@ -157,7 +160,12 @@ class Checkpointer:
         self._events.add("checkpoint", text, level=logging.ERROR)
 
     def _training_score(self) -> TrainingScore | None:
-        """Return the mean return of the newest training episodes, if there are enough of them and nobody evaluates."""
+        """Return the mean return of the newest training episodes, if there are enough of them and nobody evaluates.
+
+        None where the policy plays itself: its newest version counts as the best.
+        """
+        if self._context.league is not None and self._context.league.has_begun:
+            return None
         counters = self._context.counters
         mean, episodes = counters.episode_return_mean, counters.target_episodes
         silence = max(_EVALUATOR_SECONDS, 2.0 * (self._spec.evaluation.seconds or 0.0))
@@ -167,12 +175,13 @@ class Checkpointer:
             return None
         return TrainingScore(return_mean=mean, episodes=episodes, true_task=self._spec.environment.trains_true_task)
 
-    # ------------------------------------------------------------------------------- on the thread that writes
-
-    def _add(self, job: Callable[[], None]) -> None:
+    def add(self, job: Callable[[], None]) -> None:
+        """Let the thread that writes do something, after what it was given before."""
         with self._counting:
             self._unfinished += 1
         self._jobs.put(job)
+
+    # ------------------------------------------------------------------------------- on the thread that writes
 
     def _work(self) -> None:
         while True:

@@ -171,3 +171,17 @@ def test_a2c_gives_bit_for_bit_equal_weights_in_one_process_and_in_several(
     counts = [float(state[name].min()) for name in ("observations/observation/count", "returns/count") if name in state]
     env_steps = json.loads((tmp_path / "many" / "summary.json").read_text())["env_steps"]
     assert counts == [env_steps] * 2  # each env_step counts once; reset rows do not
+
+
+def test_a2c_gives_bit_for_bit_equal_weights_of_a_policy_that_plays_itself(tmp_path: Path) -> None:
+    """Without opponents, whose versions come when they come, the rows of a game depend on the seed alone."""
+    alone = {"past_share": 0.0, "rating_share": 0.0, "opponents": {}}
+    settings = {
+        "environment": {"id": "pettingzoo.classic.tictactoe_v3"},
+        "collection": {"actors": 2, "envs_per_actor": 3, "rollout_length": 20},
+        "training": {"algorithm": "a2c", "env_steps": 800, "stop_when_solved": False},
+        "league": alone,
+    }
+    assert train_in_one_process(run_spec(settings), tmp_path / "one").finished
+    assert train_in_one_process(run_spec(settings), tmp_path / "two").finished
+    assert checkpoint_files(tmp_path / "one") == checkpoint_files(tmp_path / "two")

@@ -58,6 +58,7 @@ class Films:
     stacked: bool = False
     played: SyncVectorEnv = field(init=False)
     seats: int = 1
+    games: None = None
 
     def __post_init__(self) -> None:
         self.played = SyncVectorEnv(
