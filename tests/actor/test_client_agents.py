@@ -215,3 +215,15 @@ def test_steps_of_hosted_matches_count_once(turns: bool, algorithm: str) -> None
         assert (rollout.frames["agent"][:-1, :, 0] == numbers % 2).all()
     assert sum(rollout.agent_steps for rollout in rollouts) == 4 * ROWS
     assert sum(rollout.env_steps for rollout in rollouts) == (4 if turns else 2) * ROWS
+
+
+def test_each_agent_has_its_share_of_the_rollouts_that_are_taken() -> None:
+    """The agents fill their rollouts together, faster than the service takes them."""
+    client, robots = begun(Played(run_spec()))
+    seen = set[int]()
+    for _ in range(60 * ROWS):
+        for agent, robot in zip(client.agents, robots, strict=True):
+            step(agent, robot)
+        if client.dropped and client.has_rollout():
+            seen.add(of_agent(take(client)))
+    assert seen == set(range(AGENTS))
