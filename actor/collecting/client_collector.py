@@ -131,7 +131,7 @@ class ClientCollector:
         return self._exchange.has_rollout()
 
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout | None:
-        """See Collector. Return an agent's oldest full rollout. `on_row` has no effect: the caller's loop makes the rows."""
+        """See Collector. Return an agent's oldest full rollout. `on_row` has no effect: the loop makes the rows."""
         rollout = self._exchange.take()
         return None if rollout is None else replace(rollout, identity=identity)
 
