@@ -53,6 +53,15 @@ def sides_of(league: LeagueSpec, agents: Sequence[str]) -> tuple[tuple[int, ...]
     return sides
 
 
+def outcome(means: Sequence[float], side: int) -> int:
+    """Return 0 if a side has won a match, 1 for a draw, 2 if it has lost: against the best of the other sides.
+
+    `means`: of the returns of each side's agents.
+    """
+    own, best = means[side], max(mean for other, mean in enumerate(means) if other != side)
+    return 1 if math.isclose(own, best, rel_tol=1e-9, abs_tol=1e-9) else 0 if own > best else 2
+
+
 def rating_copies(league: LeagueSpec, agents: Sequence[str]) -> int:
     """Return how many copies of a game only rate players, besides those that are learned from."""
     return 1 if league.rating_share > 0.0 and len(sides_of(league, agents)) > 1 else 0
@@ -339,10 +348,7 @@ class Lineup:
             return
         first = copy * self._seats
         means = [float(self._scores[first + members].mean()) for members in self._sides]
-        own = means.pop(match.side)
-        best = max(means)
-        result = 1 if math.isclose(own, best, rel_tol=1e-9, abs_tol=1e-9) else 0 if own > best else 2
-        self._counts.setdefault(match, [0, 0, 0])[result] += 1
+        self._counts.setdefault(match, [0, 0, 0])[outcome(means, match.side)] += 1
 
     def take_matches(self) -> Matches | None:
         """Return the results since the last call; None if no match ended."""
