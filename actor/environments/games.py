@@ -36,11 +36,6 @@ from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModule
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
 _SHOWN = ("ansi", "rgb_array")  # render modes, the best first
-<<<<<<< HEAD
-_MOST_NAMES = 6  # of agents in a message
-=======
-_AGENT = "agent"  # component of the observation with environment.agent_ids
->>>>>>> main
 
 _logger = logging.getLogger(__name__)
 
@@ -464,21 +459,6 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
     if len(groups) > 1:
         raise DifferentSpacesError(spec.id, roles_of(list(groups.values()), possible))
     return chosen
-
-
-<<<<<<< HEAD
-def _listed(agents: Sequence[str]) -> str:
-    more = len(agents) - _MOST_NAMES
-    return ", ".join(agents[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
-=======
-def _with_agent(space: gymnasium.Space, seats: int) -> gymnasium.spaces.Dict:
-    parts = dict(space.spaces) if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
-    if _AGENT in parts:
-        raise EnvironmentSetupError(
-            f"the observation has a component {_AGENT!r} of its own: leave environment.agent_ids unset"
-        )
-    return gymnasium.spaces.Dict({**parts, _AGENT: gymnasium.spaces.Discrete(seats)})
->>>>>>> main
 
 
 def _only(space: gymnasium.Space, batch: Any, row: int) -> Any:
