@@ -18,7 +18,7 @@ import math
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from types import TracebackType
@@ -123,7 +123,9 @@ class Client:
         safe_action: Any = None,
         max_policy_age: float | None = None,
         untrained: bool = False,
-        agents: int = 1,
+        agents: int | None = None,
+        seats: Sequence[str] = (),
+        turns: bool | None = None,
     ) -> None:
         """Join a run, and wait for the first policy.
 
@@ -145,14 +147,25 @@ class Client:
             newer policy; default: 30.
           untrained: with a safe action, whether a policy may act that no update of this run has changed. Such a policy
             is random, unless the run began with trained weights.
-          agents: number of agents in the loop, each with these spaces: robots, players, or copies of a simulator.
+          agents: number of agents in the loop, each with these spaces: robots, players, or copies of a simulator;
+            default: 1, or one for each seat.
+          seats: of a game that the loop hosts: names of the seats of a match, in the order of the agents of the run's
+            environment. The agents hold them in this order, match after match: with two seats, agents 0 and 1 play the
+            first match, 2 and 3 the second.
+          turns: with seats, whether they act one after the other, so that each action is a step of the game; False:
+            they act together, and the actions of one match up to the next one of the same seat are one step.
 
         Raises ValueError for a safe action that is not in the action space, a number of agents that is not from 1 to
-        4096, another link, or a timeout that is not above 0; ActorError, TransportError, EnvironmentSetupError,
-        AddressError or CredentialsError.
+        4096 or does not fill whole matches, unfit names of seats, seats without `turns`, another link, or a timeout
+        that is not above 0; ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
         """
+        if isinstance(seats, str) or (bool(seats) != (turns is not None)):
+            raise ValueError("give both seats, a list of names, and turns, or neither")
+        agents = agents if agents is not None else max(len(seats), 1)
         if not isinstance(agents, Integral) or not 1 <= agents <= MAX_ENVIRONMENTS:
             raise ValueError(f"agents is {agents!r}: it must be from 1 to {MAX_ENVIRONMENTS}")
+        if seats and agents % len(seats):
+            raise ValueError(f"agents is {agents}: with {len(seats)} seats in each match it must be a multiple of them")
         if link not in get_args(LinkChoice):
             raise ValueError(f"link is {link!r}: choose from {', '.join(get_args(LinkChoice))}")
         if not isinstance(timeout, Real) or not timeout > 0.0:
@@ -174,7 +187,14 @@ class Client:
         self._config = config
         self._stop = threading.Event()
         self._collector = ClientCollector(
-            observation_space, action_space, action_mask, guard, agents=agents, check=self._check
+            observation_space,
+            action_space,
+            action_mask,
+            guard,
+            agents=agents,
+            seats=seats,
+            turns=turns is not False,
+            check=self._check,
         )
         self.agents = self._collector.agents
         self._clocks: list[Clock] = []

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.actor.collecting.client_rows import ClientRows, check_run, finished_copy, make_client_rows
-from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
+from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
+from daedalus.actor.collecting.client_seats import MatchSeat, seated_space
+from daedalus.actor.collecting.rollout_writer import RowInputs
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
@@ -29,6 +30,7 @@ class ClientActor:
     def __init__(self, join: Join, spaces: ClientSpaces, uploads: ClientUploads) -> None:
         """`join` names the actor and its incarnation."""
         self.join, self.spaces, self.uploads = join, spaces, uploads
+        self._seat: MatchSeat | None = None
         self.heard_at = time.monotonic()
         self.version: PolicyVersion | None = None  # of the rollout that is being written
         self._on_action: Callable[[Any], None] = _ignore  # receives the action that the client waits for
@@ -49,6 +51,17 @@ class ClientActor:
         """The learner epoch that it has joined; -1 before the first."""
         return -1 if self._session is None else self._session.learner_epoch
 
+    @property
+    def seat(self) -> MatchSeat | None:
+        """Its seat in the match that the client hosts, or None."""
+        return self._seat
+
+    @seat.setter
+    def seat(self, seat: MatchSeat | None) -> None:
+        self._seat = seat
+        if self._rows is not None:
+            self._rows.seat = seat
+
     # --------------------------------------------------------------------------------------------- joining
 
     def prepare(self, spec: ActorSpec) -> tuple[Join, Transforms]:
@@ -56,7 +69,8 @@ class ClientActor:
         mask = None if self.spaces.example_mask is None else mask_of_one(self.spaces.example_mask)
         try:
             check_run(spec)
-            transforms = Transforms(spec.environment, self.spaces.observation_space, self.spaces.action_space, mask)
+            observed = seated_space(spec, self._seat, self.spaces.observation_space)
+            transforms = Transforms(spec.environment, observed, self.spaces.action_space, mask)
         except (ActorError, EnvironmentSetupError) as error:
             raise ClientError("refused", str(error)) from None
         check_images(self.spaces.stated, spec.environment)
@@ -111,6 +125,7 @@ class ClientActor:
                 epsilon=self._session.epsilon,
                 example_mask=self.spaces.example_mask,
                 on_full=self._keep,
+                seat=self._seat,
             )
         except PolicyError as error:
             raise ClientError("refused", str(error)) from None
@@ -184,9 +199,9 @@ class ClientActor:
         """Let go of the policy version: this actor will not act again."""
         self.version = self._rows = None
 
-    def _keep(self, writer: RolloutWriter) -> None:
+    def _keep(self, rows: ClientRows) -> None:
         assert self.version is not None
-        rollout = finished_copy(writer, self.version.version)
+        rollout = rows.finished_copy(self.version.version)
         self._full_version = self.version.version
         if self._rows_epoch == self.epoch:  # otherwise it is meant for a previous learner
             self.uploads.keep(rollout)

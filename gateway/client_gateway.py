@@ -11,7 +11,7 @@ import asyncio
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -179,8 +179,12 @@ class Gateway:
 
     # ------------------------------------------------------------------------------------------- the clients
 
-    async def admit(self, hello: Hello, address: str, on_end: Callable[[ClientError | str], None]) -> ClientActor:
-        """Return the actor of a client once it may act. Raises ClientError if it cannot take part.
+    async def admit(
+        self, hello: Hello, address: str, on_end: Callable[[ClientError | str], None]
+    ) -> dict[str, ClientActor]:
+        """Return the actor of each seat of a client, once all may act. Raises ClientError if it cannot take part.
+
+        A client without a match has one actor, under the empty name. That of a seat is called NAME.SEAT.
 
         Args:
           hello: the client's message.
@@ -189,25 +193,32 @@ class Gateway:
         """
         if self._stop.is_set():
             raise ClientError("unavailable", "the gateway stops")
-        name = self._config.actor_name(hello.name)
         spaces = ClientSpaces(hello.observations, hello.actions)
-        if name in self._seats:
+        names = {self._config.actor_name(hello.name): ""}
+        if hello.match:
+            names = {self._config.actor_name(f"{hello.name}.{name}"): name for name in hello.match[0].seats}
+        if names.keys() & self._seats.keys():
             # It may be the same client, whose connection was lost without a word: pings end it soon.
             reason = f"a client named {hello.name!r} is connected: choose another name, or try again in 20 s"
             raise ClientError("unavailable", reason)
-        actor = self._parked.take(name, spaces) or self._new_actor(name, spaces, address)
-        seat = self._seats[name] = Seat(actor, on_end, self._joining.presence())
+        actors: dict[str, ClientActor] = {}
         try:
+            for number, (name, seat) in enumerate(names.items()):
+                actor = self._parked.take(name, spaces) or self._new_actor(name, spaces, address)
+                actor.seat = hello.match[number] if hello.match else None
+                self._seats[name] = Seat(actor, on_end, self._joining.presence())
+                actors[seat] = actor
             async with asyncio.timeout(JOIN_SECONDS):
-                await self._enter(seat)
+                for name in names:
+                    await self._enter(self._seats[name])
         except TimeoutError:
-            self.leave(actor)
+            self.leave(actors)
             missing = "learner" if self.run.session is None else "policy"
             raise ClientError("unavailable", f"no {missing} came within {JOIN_SECONDS:g} s: try again later") from None
         except BaseException:
-            self.leave(actor)
+            self.leave(actors)
             raise
-        return actor
+        return actors
 
     def _new_actor(self, name: str, spaces: ClientSpaces, address: str) -> ClientActor:
         origin = Origin(host=self._origin.host, software=self._origin.software, address=address)
@@ -224,8 +235,12 @@ class Gateway:
                     return
                 await self.run.change()
 
-    def leave(self, actor: ClientActor) -> None:
-        """End the episode of a client that disconnected, as truncated. It may return for a minute."""
+    def leave(self, actors: Mapping[str, ClientActor]) -> None:
+        """End the episodes of a client that disconnected, as truncated. It may return for a minute."""
+        for actor in actors.values():
+            self._leave(actor)
+
+    def _leave(self, actor: ClientActor) -> None:
         seat = self._seats.get(actor.name)
         if seat is None or seat.actor is not actor:
             return
@@ -299,7 +314,8 @@ class Gateway:
             self.run.announce()
 
     def _drop_slowest(self) -> None:
-        seat = min(self._seats.values(), key=lambda seat: seat.actor.heard_at, default=None)
+        holders = [seat for seat in self._seats.values() if seat.actor.version is not None]
+        seat = min(holders, key=lambda seat: seat.actor.heard_at, default=None)
         if seat is not None and time.monotonic() > seat.actor.heard_at + _SLOW_SECONDS:
             seat.on_end(ClientError("unavailable", "the client is idle, and others wait for its memory"))
         else:

@@ -4,11 +4,15 @@ gateway/protocol.json is the same as a JSON Schema. A client sends JSON in text 
 answers have the form of its hello.
 """
 
+import itertools
 import json
 import math
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import msgpack
+
+from daedalus.actor.collecting.client_seats import MatchSeat, match_seats
 
 ErrorCode = Literal[
     "malformed",  # not a message of this protocol
@@ -29,6 +33,7 @@ class ClientError(Exception):
 
 VERSION = 1
 MAX_HELLO_BYTES = 256 << 10
+_MOST_NAMES = 6  # of seats in a message
 
 State = Literal["new", "ready", "acted"]
 # What a client may send in each state, and the state after the gateway's answer.
@@ -53,6 +58,7 @@ class Hello(NamedTuple):
     observations: Any  # of protocol/spaces.py, as JSON
     actions: Any
     token: str
+    match: tuple[MatchSeat, ...] = ()  # the seats that the client holds; empty: it plays no match
 
 
 class Act(NamedTuple):
@@ -62,12 +68,14 @@ class Act(NamedTuple):
     action_mask: Any
     reward: float  # of the last action; it is added to those that came before
     override: Any = None  # the action that is played in place of the policy's
+    seat: str = ""  # of the match that acts; empty without a match
 
 
 class Reward(NamedTuple):
     """A reward of the last action."""
 
     reward: float
+    seat: str = ""
 
 
 class EndEpisode(NamedTuple):
@@ -76,26 +84,37 @@ class EndEpisode(NamedTuple):
     terminated: bool
     observation: Any  # the last one; None if it is not known
     reward: float
+    seat: str = ""
 
 
 ClientMessage = Hello | Act | Reward | EndEpisode
 
 _FIELDS: dict[str, tuple[set[str], set[str]]] = {  # required and optional fields of each type
-    "hello": ({"version", "name", "observations", "actions"}, {"token"}),
-    "act": ({"observation"}, {"action_mask", "reward", "override"}),
-    "reward": ({"reward"}, set()),
-    "end_episode": ({"terminated"}, {"observation", "reward"}),
+    "hello": ({"version", "name", "observations", "actions"}, {"token", "match"}),
+    "act": ({"observation"}, {"action_mask", "reward", "override", "seat"}),
+    "reward": ({"reward"}, {"seat"}),
+    "end_episode": ({"terminated"}, {"observation", "reward", "seat"}),
 }
 _to_json = json.JSONEncoder(separators=(",", ":")).encode
 _ALLOWED = {kind: {"type"} | required | optional for kind, (required, optional) in _FIELDS.items()}
 
 
-def read(data: str | bytes, state: State) -> ClientMessage:
-    """Return a client's message. Raises ClientError if it is malformed, or not legal in this state."""
+def read(data: str | bytes, states: Mapping[str, State]) -> ClientMessage:
+    """Return a client's message. Raises ClientError if it is malformed, or not legal in this state.
+
+    `states` are those of the client's seats by name, or that of a client without a match under the empty name.
+    """
     message = _decoded(data)
     kind = message.get("type") if isinstance(message, dict) else None
     if not isinstance(kind, str) or kind not in _FIELDS:
         raise ClientError("malformed", f"the message has no type that a client sends: use one of {', '.join(_FIELDS)}")
+    seat = message.get("seat", "")
+    if kind == "hello":
+        seat, state = "", next(iter(states.values()))
+    elif not isinstance(seat, str) or seat not in states:
+        raise ClientError("misfit", _seat_fault(kind, seat, states))
+    else:
+        state = states[seat]
     if (state, kind) not in TRANSITIONS:
         raise ClientError("out_of_turn", f"{kind} is out of turn: {_HINTS[state]}")
     unknown = message.keys() - _ALLOWED[kind]
@@ -107,14 +126,14 @@ def read(data: str | bytes, state: State) -> ClientMessage:
     match kind:
         case "act":
             reward = _number(message.get("reward", 0.0))
-            return Act(message["observation"], message.get("action_mask"), reward, message.get("override"))
+            return Act(message["observation"], message.get("action_mask"), reward, message.get("override"), seat)
         case "reward":
-            return Reward(_number(message["reward"]))
+            return Reward(_number(message["reward"]), seat)
         case "end_episode":
             terminated = message["terminated"]
             if not isinstance(terminated, bool):
                 raise ClientError("malformed", "terminated must be true or false")
-            return EndEpisode(terminated, message.get("observation"), _number(message.get("reward", 0.0)))
+            return EndEpisode(terminated, message.get("observation"), _number(message.get("reward", 0.0)), seat)
         case _:
             return _hello(message)
 
@@ -125,7 +144,26 @@ def _hello(message: dict[str, Any]) -> Hello:
     name, token = message["name"], message.get("token", "")
     if not isinstance(name, str) or not isinstance(token, str):
         raise ClientError("malformed", "name and token must be text")
-    return Hello(name, message["observations"], message["actions"], token)
+    return Hello(name, message["observations"], message["actions"], token, _match(message.get("match")))
+
+
+def _match(value: Any) -> tuple[MatchSeat, ...]:
+    if value is None:
+        return ()
+    match value:
+        case {"seats": [*seats], "turns": bool(turns)} if len(value) == len(("seats", "turns")):
+            try:
+                return tuple(match_seats(seats, turns=turns))
+            except ValueError as error:
+                raise ClientError("malformed", str(error)) from None
+    raise ClientError("malformed", "match must have seats, a list of names, and turns, true or false")
+
+
+def _seat_fault(kind: str, seat: Any, states: Mapping[str, State]) -> str:
+    if "" in states:
+        return f"{kind} names the seat {_shown(seat)}, but the hello has no match with seats"
+    known = ", ".join(itertools.islice(states, _MOST_NAMES))
+    return f"{kind} {f'names the seat {_shown(seat)}' if seat else 'names no seat'}: the match of the hello has {known}"
 
 
 def _number(value: Any) -> float:
@@ -171,14 +209,16 @@ def welcome(run: str, environment: str, name: str) -> dict[str, Any]:
     return {"type": "welcome", "version": VERSION, "run": run, "environment": environment, "name": name}
 
 
-def action(value: Any) -> dict[str, Any]:
+def action(value: Any, seat: str = "") -> dict[str, Any]:
     """Return the answer to act."""
-    return {"type": "action", "action": value}
+    message = {"type": "action", "action": value}
+    return {**message, "seat": seat} if seat else message
 
 
-def error(fault: ClientError) -> dict[str, Any]:
-    """Return the message about a fault."""
-    return {"type": "error", "code": fault.code, "reason": fault.reason}
+def error(fault: ClientError, seat: str = "") -> dict[str, Any]:
+    """Return the message about a fault, of a seat's message if it is known."""
+    message = {"type": "error", "code": fault.code, "reason": fault.reason}
+    return {**message, "seat": seat} if seat else message
 
 
 def run_ended(reason: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import contextlib
 import logging
 import time
 from collections import deque
+from functools import partial
 from typing import Any
 
 from daedalus.gateway import client_messages
@@ -13,7 +14,7 @@ from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.client_messages import TRANSITIONS, Act, ClientError, EndEpisode, Hello, Reward, State
 from daedalus.gateway.places import Places
-from daedalus.gateway.security import Guard, RateLimit
+from daedalus.gateway.security import MESSAGES_BURST, MESSAGES_PER_SECOND, Guard, RateLimit
 
 _logger = logging.getLogger(__name__)
 
@@ -39,13 +40,16 @@ class ClientConnection:
         self._reached, self._guard, self._places, self._scope = gateway, guard, places, scope
         self._receive_event, self._send_event = receive, send
         self._channel = channel_of(scope)
-        self._state: State = "new"
+        self._states: dict[str, State] = {"": "new"}  # of the seats of the client's match; without one of the client
         self._as_text = True
         self._end: ClientError | str | None = None  # why the gateway ends the connection
         self._task: asyncio.Task[Any] | None = None
-        self._seat: tuple[Gateway, ClientActor] | None = None  # while messages are answered
+        self._gateway: Gateway | None = None  # while messages are answered
+        self._actors: dict[str, ClientActor] = {}  # by seat
         self._unanswered: deque[str | bytes] = deque()
-        self._is_waiting = False  # for an action, or for the rate limit
+        self._held: Act | Reward | EndEpisode | None = None  # read, of a seat that waits for its action
+        self._waiting = set[str]()  # seats that wait for their actions
+        self._is_paused = False  # by the rate limit
         self._rate = RateLimit()
         self._faults = 0
 
@@ -80,10 +84,14 @@ class ClientConnection:
             return
         text = event.get("text")
         self._as_text = text is not None
-        hello = client_messages.read(event["bytes"] if text is None else text, self._state)
+        hello = client_messages.read(event["bytes"] if text is None else text, self._states)
         assert isinstance(hello, Hello)
         owner = self._guard.check_token(hello.name, hello.token) or self._channel.peer
-        with self._places.take(owner, self.end):
+        seats = max(len(hello.match), 1)
+        with contextlib.ExitStack() as places:
+            for _ in range(seats):
+                places.enter_context(self._places.take(owner, self.end))
+            self._rate = RateLimit(seats * MESSAGES_PER_SECOND, seats * MESSAGES_BURST)
             self._channel.settle(True)
             await self._take_part(hello)
 
@@ -92,24 +100,26 @@ class ClientConnection:
         reading = asyncio.create_task(self._read_early())
         try:
             gateway = await self._reach()
-            actor = await gateway.admit(hello, address, self.end)
+            actors = await gateway.admit(hello, address, self.end)
         finally:
             reading.cancel()
         try:
-            self._channel.limit(actor.spaces.max_message_bytes)
+            first = next(iter(actors.values()))
+            self._channel.limit(first.spaces.max_message_bytes)
             session = gateway.run.session
             if session is not None:
                 self._write(client_messages.welcome(session.run, session.spec.environment.id, hello.name))
-            _logger.info("client %s connected from %s", actor.name, address)
-            self._state, self._seat = "ready", (gateway, actor)
+            _logger.info("client %s connected from %s", hello.name, address)
+            self._states = dict.fromkeys(actors, "ready")
+            self._gateway, self._actors = gateway, actors
             self._channel.divert(self._on_message, self._go_on)
             self._go_on()  # with messages that came early
             while (await self._receive_event())["type"] != "websocket.disconnect":
                 pass
         finally:
-            self._seat = None
-            gateway.leave(actor)
-            _logger.info("client %s disconnected", actor.name)
+            self._gateway = None
+            gateway.leave(actors)
+            _logger.info("client %s disconnected", hello.name)
 
     async def _read_early(self) -> None:
         """Keep messages that come before the answer to hello; end the connection if the client disconnects.
@@ -142,48 +152,78 @@ class ClientConnection:
         self._go_on()
 
     def _go_on(self) -> None:
-        """Answer messages in turn, until an action must be chosen, the client is too fast, or it does not read."""
-        while self._unanswered and not self._is_waiting and self._channel.is_writable and self._end is None:
-            if self._seat is None:
-                return
-            now = self._seat[1].heard_at = time.monotonic()
-            if pause := self._rate.take(now):
-                self._is_waiting = True
+        """Answer messages in turn, until an action must be chosen, the client is too fast, or it does not read.
+
+        A seat that waits for its action holds up messages of its own, and those behind them.
+        """
+        while self._may_answer():
+            if self._held is not None:
+                held, self._held = self._held, None
+                self._answer(held)
+            elif pause := self._rate.take(time.monotonic()):
+                self._is_paused = True
                 asyncio.get_running_loop().call_later(pause, self._after_pause)
             else:
-                self._answer(*self._seat, self._unanswered.popleft())
+                self._read(self._unanswered.popleft())
         self._channel.pause(len(self._unanswered) >= _MAX_UNANSWERED)
 
+    def _may_answer(self) -> bool:
+        if self._gateway is None or self._is_paused or not self._channel.is_writable or self._end is not None:
+            return False
+        if self._held is not None:
+            return self._held.seat not in self._waiting
+        return bool(self._unanswered) and len(self._waiting) < len(self._states)
+
     def _after_pause(self) -> None:
-        self._is_waiting = False
-        if self._seat is not None:
-            self._answer(*self._seat, self._unanswered.popleft())
+        self._is_paused = False
+        if self._gateway is not None:
+            self._read(self._unanswered.popleft())
             self._go_on()
 
-    def _answer(self, gateway: Gateway, actor: ClientActor, data: str | bytes) -> None:
+    def _read(self, data: str | bytes) -> None:
         try:
-            match message := client_messages.read(data, self._state):
+            message = client_messages.read(data, self._states)
+        except ClientError as error:
+            self._refuse(error, "")
+            return
+        assert not isinstance(message, Hello)  # which is out of turn
+        if message.seat in self._waiting:
+            self._held = message
+        else:
+            self._answer(message)
+
+    def _answer(self, message: Act | Reward | EndEpisode) -> None:
+        assert self._gateway is not None
+        seat = message.seat
+        actor = self._actors[seat]
+        actor.heard_at = time.monotonic()
+        try:
+            match message:
                 case Act():
-                    gateway.act(actor, message, self._on_action)
-                    self._is_waiting = True
+                    self._gateway.act(actor, message, partial(self._on_action, seat))
+                    self._waiting.add(seat)
+                    self._states[seat] = TRANSITIONS[self._states[seat], "act"]
                 case Reward():
                     actor.reward(message.reward)
                     self._channel.acknowledge()
                 case EndEpisode():
                     actor.end_episode(message)
-                    self._state = TRANSITIONS[self._state, "end_episode"]
+                    self._states[seat] = TRANSITIONS[self._states[seat], "end_episode"]
                     self._channel.acknowledge()
         except ClientError as error:
-            self._faults += 1
-            if self._faults == _MAX_FAULTS:
-                self.end(error)
-            else:
-                self._write(client_messages.error(error))
+            self._refuse(error, seat)
 
-    def _on_action(self, action: Any) -> None:
-        self._is_waiting, self._state = False, TRANSITIONS[self._state, "act"]
-        self._write(client_messages.action(action))
-        if self._unanswered:
+    def _refuse(self, error: ClientError, seat: str) -> None:
+        self._faults += 1
+        if self._faults == _MAX_FAULTS:
+            self.end(error)
+        else:
+            self._write(client_messages.error(error, seat))
+
+    def _on_action(self, seat: str, action: Any) -> None:
+        self._waiting.discard(seat)
+        self._write(client_messages.action(action, seat))
+        if self._unanswered or self._held is not None:
             self._go_on()
 
     def _write(self, message: dict[str, Any]) -> None:

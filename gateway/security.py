@@ -139,13 +139,13 @@ class OperatorToken:
         return "the operator"
 
 
-MESSAGES_PER_SECOND, _BURST = 1000.0, 2000.0
+MESSAGES_PER_SECOND, MESSAGES_BURST = 1000.0, 2000.0
 
 
 class RateLimit:
     """A bucket of permissions that fills at a constant rate."""
 
-    def __init__(self, rate: float = MESSAGES_PER_SECOND, burst: float = _BURST) -> None:
+    def __init__(self, rate: float = MESSAGES_PER_SECOND, burst: float = MESSAGES_BURST) -> None:
         self._rate, self._burst = rate, burst
         self._left, self._at = burst, 0.0
 

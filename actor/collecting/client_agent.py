@@ -7,9 +7,9 @@ from typing import Any
 import gymnasium
 
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
-from daedalus.actor.collecting.client_rows import ClientRows, finished_copy
+from daedalus.actor.collecting.client_rows import ClientRows
+from daedalus.actor.collecting.client_seats import MatchSeat
 from daedalus.actor.collecting.policy_guard import PolicyGuard
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.precision import Precision
 
 _logger = logging.getLogger(__name__)
@@ -19,6 +19,9 @@ _MOST_WATCHED = 1000  # observations
 
 class ClientAgent:
     """One agent, with episodes and rollouts of its own. For the caller's thread.
+
+    Of a match whose agents act in turns, call `act` at the turn of this agent only; rewards that come between its turns
+    belong to its last action.
 
     A rollout is played with one policy version. In a run whose actors wait for each update, the agent goes on with the
     last policy meanwhile, and those rows are not written.
@@ -36,6 +39,7 @@ class ClientAgent:
           check: raises what has ended the client's thread.
         """
         self._index, self._exchange, self._guard, self._check = index, exchange, guard, check
+        self.seat: MatchSeat | None = None  # in the match that the loop hosts
         self._rows: ClientRows | None = None
         self._loaded: LoadedPolicy | None = None  # that acts
         self.actions = self.overridden_actions = self.safe_actions = 0
@@ -114,10 +118,10 @@ class ClientAgent:
             raise ValueError("the episode ended without any action: call act() first")
         self._rows.end_episode(observation, terminated=terminated)
 
-    def keep(self, writer: RolloutWriter) -> None:
+    def keep(self, rows: ClientRows) -> None:
         """Hand over a full rollout. Called by the agent's rows."""
         assert self._loaded is not None
-        self._exchange.keep(self._index, finished_copy(writer, self._loaded.version))
+        self._exchange.keep(self._index, rows.finished_copy(self._loaded.version))
 
     def _switch_policy(self) -> None:
         """Continue with a policy that has begun meanwhile; drop the unfinished rollout of the previous one."""

@@ -1,7 +1,7 @@
 """The service's side of a client: rollouts from a loop that the caller owns."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 from daedalus.actor.collecting.client_agent import ClientAgent
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
 from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
+from daedalus.actor.collecting.client_seats import match_seats, seated_space
 from daedalus.actor.collecting.policy_guard import PolicyGuard
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
@@ -40,6 +40,8 @@ class ClientCollector:
         guard: PolicyGuard | None = None,
         *,
         agents: int = 1,
+        seats: Sequence[str] = (),
+        turns: bool = True,
         check: Callable[[], None] = lambda: None,
     ) -> None:
         """Construct the collector.
@@ -49,6 +51,8 @@ class ClientCollector:
           example_mask: a mask, or a map of masks by action component, if the loop has masks; else None.
           guard: decides when the safe action is played; None: never.
           agents: number of agents.
+          seats: names of the seats of each match, which the agents hold in this order, match after match; or none.
+          turns: see match_seats.
           check: called before each `act`; raises what has ended the service.
         """
         self._observation_space, self._action_space = observation_space, action_space
@@ -60,6 +64,9 @@ class ClientCollector:
         self._program: OnnxRuntime | None = None
         self._exchange = ClientExchange(agents)
         self.agents = tuple(ClientAgent(index, self._exchange, self.guard, check) for index in range(agents))
+        for first in range(0, agents if seats else 0, max(len(seats), 1)):
+            for seat in match_seats(seats, turns=turns):
+                self.agents[first + seat.number].seat = seat
 
     @property
     def dropped(self) -> int:
@@ -75,7 +82,8 @@ class ClientCollector:
         """See Collector."""
         check_run(spec)
         example = None if self._example_mask is None else mask_of_one(self._example_mask)
-        self._transforms = Transforms(spec.environment, self._observation_space, self._action_space, example)
+        observed = [seated_space(spec, agent.seat, self._observation_space) for agent in self.agents]
+        self._transforms = Transforms(spec.environment, observed[0], self._action_space, example)
         for agent in self.agents:
             agent.watch(without(self._observation_space, spec.environment.leave_out))
         return self._transforms.spaces, len(self.agents) if spec.algorithm.synchronous else 1
@@ -91,7 +99,7 @@ class ClientCollector:
         assert self._transforms is not None
         assert self._program is not None
 
-        def keep(full: RolloutWriter) -> None:
+        def keep(full: ClientRows) -> None:
             agent.keep(full)
             self.on_rollout()
 
@@ -103,6 +111,7 @@ class ClientCollector:
             epsilon=epsilon,
             example_mask=self._example_mask,
             on_full=keep,
+            seat=agent.seat,
         )
 
     def load(self, snapshot: Snapshot) -> None:
@@ -122,7 +131,7 @@ class ClientCollector:
         return self._exchange.has_rollout()
 
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout | None:
-        """See Collector. Return the oldest full rollout. `on_row` has no effect: the caller's loop makes the rows."""
+        """See Collector. Return an agent's oldest full rollout. `on_row` has no effect: the loop makes the rows."""
         rollout = self._exchange.take()
         return None if rollout is None else replace(rollout, identity=identity)
 

@@ -38,6 +38,7 @@ def side_by_side(rollouts: Sequence[Rollout]) -> Rollout:
         episode_returns=np.concatenate([each.episode_returns for each in rollouts]),
         episode_lengths=np.concatenate([each.episode_lengths for each in rollouts]),
         overridden=np.concatenate(overridden, axis=1) if any(each.any() for each in overridden) else None,
+        game_steps=None if first.game_steps is None else sum(each.env_steps for each in rollouts),
     )
 
 
@@ -72,7 +73,8 @@ class ClientExchange:
         self._confirmed_at = -math.inf  # the monotonic time at which the newest policy was the learner's newest
         self._may_begin = [True] * agents  # whether the agent's next row may begin a rollout
         self._parts: dict[int, Rollout] = {}  # full rollouts by agent, while they wait for those of the others
-        self._full: deque[Rollout] = deque()
+        # By agent, in turns: agents fill their rollouts together, and the first would else have all that are taken.
+        self._full: dict[int, deque[Rollout]] = {agent: deque() for agent in range(agents)}
 
     @property
     def dropped(self) -> int:
@@ -90,8 +92,9 @@ class ClientExchange:
         with self._lock:
             self._begun, self._newest, self._together = rows, None, together
             self._may_begin = [not together] * self._agents
-            self._dropped += len(self._full) + len(self._parts)
-            self._full.clear()
+            self._dropped += sum(map(len, self._full.values())) + len(self._parts)
+            for full in self._full.values():
+                full.clear()
             self._parts.clear()
 
     def offer(self, policy: LoadedPolicy) -> None:
@@ -109,13 +112,15 @@ class ClientExchange:
 
     def has_rollout(self) -> bool:
         """Return whether `take` would return a rollout now. Safe from any thread."""
-        return bool(self._full)
+        return any(map(len, list(self._full.values())))
 
     def take(self) -> Rollout | None:
-        """Return the oldest full rollout; where there is none, the agents may begin rollouts."""
+        """Return the oldest full rollout of the next agent in turn; without any, the agents may begin rollouts."""
         with self._lock:
-            if self._full:
-                return self._full.popleft()
+            for agent, full in self._full.items():
+                if full:
+                    self._full[agent] = self._full.pop(agent)  # its turn comes last
+                    return full.popleft()
             self._may_begin = [agent not in self._parts for agent in range(self._agents)]
             return None
 
@@ -155,7 +160,7 @@ class ClientExchange:
             elif self._together:
                 self._keep_part(agent, rollout)
             else:
-                self._append(rollout)
+                self._append(agent, rollout)
 
     def _keep_part(self, agent: int, rollout: Rollout) -> None:
         """Keep a rollout until every agent has one of the same policy version."""
@@ -167,11 +172,12 @@ class ClientExchange:
             self._dropped += 1
             self._may_begin[other] = True
         if len(self._parts) == self._agents:
-            self._append(side_by_side([self._parts[each] for each in range(self._agents)]))
+            self._append(0, side_by_side([self._parts[each] for each in range(self._agents)]))
             self._parts.clear()
 
-    def _append(self, rollout: Rollout) -> None:
-        self._full.append(rollout)
-        if len(self._full) > _MAX_FULL_ROLLOUTS * self._agents:
-            self._full.popleft()
+    def _append(self, agent: int, rollout: Rollout) -> None:
+        full = self._full[agent]
+        full.append(rollout)
+        if len(full) > _MAX_FULL_ROLLOUTS:
+            full.popleft()
             self._dropped += 1

@@ -2,11 +2,14 @@
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
+from daedalus.actor.collecting.client_seats import MatchSeat
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
+from daedalus.actor.environments.components import numbered
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.environments.vector_environments import Observed
 from daedalus.actor.errors import ActorError
@@ -33,7 +36,9 @@ class ClientRows:
         *,
         example_mask: Any,
         bootstrap_terminations: bool,
-        on_full: Callable[[RolloutWriter], None],
+        on_full: Callable[["ClientRows"], None],
+        seat: MatchSeat | None = None,
+        agent_ids: bool = False,
     ) -> None:
         """Construct the rows.
 
@@ -42,8 +47,11 @@ class ClientRows:
           writer: of one environment. It has not started.
           example_mask: a mask, or a map of masks by action component, if the loop has masks; else None.
           bootstrap_terminations: whether a terminated episode needs its last observation.
-          on_full: called when the rollout is full: it must call `writer.finish`.
+          on_full: called when the rollout is full: it must call `finished_copy`.
+          seat: of a match whose seats the loop hosts; None: of none.
+          agent_ids: whether the policy observes the number of the seat.
         """
+        self.seat, self._is_numbered = seat, agent_ids and seat is not None
         self._transforms, self._writer, self._has_masks = transforms, writer, example_mask is not None
         self._bootstrap_terminations = bootstrap_terminations
         self._on_full = on_full
@@ -55,6 +63,8 @@ class ClientRows:
         self._episode_ended = False  # the next row is a reset row
         self._cut: Literal["", "resets", "restarts"] = ""  # after `cut`: what the next observation does to the row
         self._reward, self._terminated, self._truncated = 0.0, False, False  # of the current row
+        self._is_step = False  # whether the current row is the first to learn from in a step of the match
+        self._game_steps = 0  # of this rollout
 
     @property
     def in_episode(self) -> bool:
@@ -83,7 +93,7 @@ class ClientRows:
                 "this client was constructed without an action_mask: construct it with an example of one, or act() "
                 "would choose illegal actions"
             )
-        observed = self._transforms.observe_one(observation, action_mask, needed=True)
+        observed = self._observed(observation, action_mask, needed=True)
         if reward:
             self.reward(reward)
         self.complete_episode()
@@ -113,7 +123,7 @@ class ClientRows:
 
     def _begin_row(self, *, overridden: bool, idle: bool) -> None:
         if idle:
-            self._writer.discard()
+            self._discard()
         # No rollout begins with an overridden row: in each there is a row to learn from.
         self._idle = idle or (overridden and self.is_between_rollouts)
         self._overridden = overridden
@@ -132,6 +142,9 @@ class ClientRows:
         self._acted = True
         if self._overridden:
             self._writer.override()
+        if self.seat is not None and self.seat.steps is not None:
+            self.seat.steps.act(self.seat.number)
+            self._is_step = not self._idle and not self._overridden and self.seat.steps.count()
         return True
 
     def env_action(self, actions: dict[str, np.ndarray]) -> Any:
@@ -160,7 +173,7 @@ class ClientRows:
             raise ValueError("the episode ended without any action: call act() first")
         last = self._last
         if observation is not None:
-            last = self._transforms.observe_one(observation, self._open_masks(), needed=False)
+            last = self._observed(observation, self._open_masks(), needed=False)
         elif not terminated:
             raise ValueError("a truncated episode needs its last observation for the bootstrap value: pass it")
         elif self._bootstrap_terminations:
@@ -172,6 +185,16 @@ class ClientRows:
             self.reward(reward)
         self._last = last
         self._terminated, self._truncated, self._ending = terminated, not terminated, True
+        self._end_step()
+
+    def _end_step(self) -> None:
+        if self.seat is not None and self.seat.steps is not None:
+            self.seat.steps.end()
+
+    def _observed(self, observation: Any, action_mask: Any, *, needed: bool) -> Observed:
+        if self._is_numbered and self.seat is not None:
+            observation = numbered(observation, self.seat.number)
+        return self._transforms.observe_one(observation, action_mask, needed=needed)
 
     def _open_masks(self) -> dict[str, np.ndarray] | None:
         """Return masks that allow every choice, as an observation without a mask of its own has; None without masks."""
@@ -201,18 +224,33 @@ class ClientRows:
             self._cut = "resets"
         else:
             self._episode_ended = True
-        self._acted, self._reward = False, 0.0
+        self._acted, self._reward, self._is_step = False, 0.0, False
+        self._end_step()
+
+    def _discard(self) -> None:
+        self._writer.discard()
+        self._game_steps = 0
 
     def _record(self, observed: Observed) -> None:
         """Complete the row of the last action."""
         full = self._writer.record(
             observed, np.array([self._reward]), np.array([self._terminated]), np.array([self._truncated])
         )
+        self._game_steps += self._is_step
         self._acted, self._reward, self._terminated, self._truncated = False, 0.0, False, False
+        self._is_step = False
         if self._idle:
-            self._writer.discard()
+            self._discard()
         elif full:
-            self._on_full(self._writer)
+            self._on_full(self)
+
+    def finished_copy(self, policy_version: int) -> Rollout:
+        """Return the full rollout in memory of its own. Whoever sends it replaces its identity."""
+        rollout = copy.deepcopy(self._writer.finish(_NO_IDENTITY, policy_version))
+        steps, self._game_steps = self._game_steps, 0
+        if self.seat is None or self.seat.steps is None:
+            return rollout
+        return replace(rollout, game_steps=steps)
 
 
 def check_run(spec: ActorSpec) -> None:
@@ -247,7 +285,8 @@ def make_client_rows(
     *,
     epsilon: float,
     example_mask: Any,
-    on_full: Callable[[RolloutWriter], None],
+    on_full: Callable[[ClientRows], None],
+    seat: MatchSeat | None = None,
 ) -> ClientRows:
     """Return the rows of one loop under one learner. Raises PolicyError if the program cannot explore as it must.
 
@@ -257,7 +296,7 @@ def make_client_rows(
       runtime: the policy.
       random: draws the noise of the policy.
       epsilon: final probability of a random action.
-      example_mask, on_full: see ClientRows.
+      example_mask, on_full, seat: see ClientRows.
     """
     writer = RolloutWriter(
         transforms.spaces,
@@ -274,9 +313,6 @@ def make_client_rows(
         example_mask=example_mask,
         bootstrap_terminations=spec.environment.bootstrap_terminations,
         on_full=on_full,
+        seat=seat,
+        agent_ids=spec.environment.agent_ids,
     )
-
-
-def finished_copy(writer: RolloutWriter, policy_version: int) -> Rollout:
-    """Return a full rollout in memory of its own. Whoever sends it replaces its identity."""
-    return copy.deepcopy(writer.finish(_NO_IDENTITY, policy_version))

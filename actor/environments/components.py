@@ -397,3 +397,22 @@ def only_of_batch(space: gymnasium.Space, batch: Any) -> Any:
     if isinstance(space, gym.Tuple):
         return tuple(only_of_batch(part, batch[index]) for index, part in enumerate(space.spaces))
     return batch[0]
+
+
+AGENT = "agent"  # component of the observation with environment.agent_ids
+
+
+def with_agent(space: gymnasium.Space, agents: int) -> gymnasium.spaces.Dict:
+    """Return an observation space with the number of the agent. Raises EnvironmentSetupError if it has one."""
+    parts = dict(space.spaces) if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
+    if AGENT in parts:
+        raise EnvironmentSetupError(
+            f"the observation has a component {AGENT!r} of its own: leave environment.agent_ids unset"
+        )
+    return gymnasium.spaces.Dict({**parts, AGENT: gymnasium.spaces.Discrete(agents)})
+
+
+def numbered(observation: Any, number: int) -> dict[str, Any]:
+    """Return an observation of `with_agent`, of the agent with a number."""
+    parts = observation if isinstance(observation, Mapping) else {"observation": observation}
+    return {**parts, AGENT: number}

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.vector.utils import create_empty_array
 
 from daedalus.actor.environments.bots import Bot, LegalActions
-from daedalus.actor.environments.components import dtype_misfit, leaves, without
+from daedalus.actor.environments.components import dtype_misfit, leaves, numbered, with_agent, without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     creation_errors,
@@ -36,7 +36,6 @@ from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModule
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
 _SHOWN = ("ansi", "rgb_array")  # render modes, the best first
-_AGENT = "agent"  # component of the observation with environment.agent_ids
 
 _logger = logging.getLogger(__name__)
 
@@ -68,7 +67,7 @@ class GameEnvironments:
         self._newest: list[tuple[Any, Any]] = [(None, None)] * self.count  # observation and mask of each bot's seat
         self._agent_ids = spec.agent_ids
         self._of_game: gymnasium.Space = copies[0].observation_space(seats[0])
-        self.observation_space = _with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
+        self.observation_space = with_agent(self._of_game, len(seats)) if spec.agent_ids else self._of_game
         self.action_space: gymnasium.Space = copies[0].action_space(seats[0])
         read = without(self.observation_space, spec.leave_out)
         self.observations: Any = create_empty_array(self.observation_space, self.count)
@@ -194,8 +193,7 @@ class GameEnvironments:
     def _write(self, seat: int, outcome: Outcome) -> None:
         observation = outcome.observation
         if self._agent_ids:
-            parts = observation if isinstance(observation, Mapping) else {"observation": observation}
-            observation = {**parts, _AGENT: self._numbers[outcome.agent]}
+            observation = numbered(observation, self._numbers[outcome.agent])
         for leaf, written in self._leaves:
             try:
                 value = leaf.of(observation)
@@ -463,15 +461,6 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
     if len(groups) > 1:
         raise DifferentSpacesError(spec.id, roles_of(list(groups.values()), possible))
     return chosen
-
-
-def _with_agent(space: gymnasium.Space, seats: int) -> gymnasium.spaces.Dict:
-    parts = dict(space.spaces) if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
-    if _AGENT in parts:
-        raise EnvironmentSetupError(
-            f"the observation has a component {_AGENT!r} of its own: leave environment.agent_ids unset"
-        )
-    return gymnasium.spaces.Dict({**parts, _AGENT: gymnasium.spaces.Discrete(seats)})
 
 
 def _only(space: gymnasium.Space, batch: Any, row: int) -> Any:

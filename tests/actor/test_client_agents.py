@@ -5,11 +5,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
 from test_client_collector import IDENTITY, ROWS, Played, Robot, run_spec, synchronous, take
 
 from daedalus.actor.collecting.client_agent import ClientAgent
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.learner.serving.rollout_judge import _episode_violation
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.messages import Snapshot
+from daedalus.protocol.spaces import DiscreteSpace
+from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout
 
 AGENTS = 3
@@ -178,3 +185,56 @@ def test_one_agent_of_a_synchronous_run_is_an_actor_with_one_environment(setting
     np.testing.assert_array_equal(together.rewards[:, :1], single.rewards)
     for name, frames in single.frames.items():
         np.testing.assert_array_equal(together.frames[name][:, :1], frames)
+
+
+def hosting(algorithm: str, *, turns: bool) -> ClientCollector:
+    """Return a client with two seats in each of two matches."""
+    settings = {"id": "engine", "backend": "pettingzoo", "agent_ids": True}
+    spec = RunSpec.model_validate(
+        {"training": {"algorithm": algorithm}, "environment": settings, "collection": {"rollout_length": ROWS}}
+    )
+    spaces = Box(-9.0, 9.0, (1,), np.float32), Discrete(2)
+    client = ClientCollector(*spaces, None, agents=4, seats=("left", "right"), turns=turns)
+    joined, environments = client.prepare(spec.for_actors())
+    assert joined.observations["agent"] == DiscreteSpace(counts=(2,))
+    assert environments == (4 if algorithm == "a2c" else 1)
+    network = ActorCritic(spec.policy, joined)
+    client.begin(OnnxRuntime(export_program(network, joined)), spec.for_actors(), 3)
+    weights = {name: parameter.detach().numpy() for name, parameter in network.named_parameters()}
+    client.load(Snapshot(learner_epoch=1, policy_version=0, program="", weights=weights))
+    assert client.collect(IDENTITY) is None  # the agents may begin
+    return client
+
+
+def act_all(client: ClientCollector) -> None:
+    """Let each agent observe its number."""
+    for number, agent in enumerate(client.agents):
+        agent.act(np.full(1, number, np.float32))
+
+
+@pytest.mark.parametrize("algorithm", ["impala", "a2c"])
+@pytest.mark.parametrize("turns", [True, False], ids=["in turns", "together"])
+def test_steps_of_hosted_matches_count_once(turns: bool, algorithm: str) -> None:
+    """Rows name the agent, and those of one step are one env_step."""
+    client = hosting(algorithm, turns=turns)
+    for _ in range(ROWS + 1):
+        act_all(client)
+    rollouts = taken(client)
+    assert [rollout.environments for rollout in rollouts] == ([4] if algorithm == "a2c" else [1] * 4)
+    for rollout in rollouts:
+        numbers = rollout.frames["observation"][:-1, :, 0]
+        assert (rollout.frames["agent"][:-1, :, 0] == numbers % 2).all()
+    assert sum(rollout.agent_steps for rollout in rollouts) == 4 * ROWS
+    assert sum(rollout.env_steps for rollout in rollouts) == (4 if turns else 2) * ROWS
+
+
+def test_each_agent_has_its_share_of_the_rollouts_that_are_taken() -> None:
+    """The agents fill their rollouts together, faster than the service takes them."""
+    client = hosting("impala", turns=True)
+    seen: list[int] = []
+    while len(seen) < 40:
+        for _ in range(ROWS):
+            act_all(client)
+        if client.dropped:
+            seen.append(int(take(client).frames["observation"][0, 0, 0]))
+    assert {seen.count(agent) for agent in range(4)} == {10}

@@ -128,7 +128,7 @@ def test_client_rollouts_equal_those_of_an_environment_collector(environment: di
 def test_oldest_rollouts_are_dropped_when_nobody_takes_them() -> None:
     client, robot = begun(Played(run_spec()))
     drive(client, robot, 200)
-    assert len(client._exchange._full) == _MAX_FULL_ROLLOUTS
+    assert len(client._exchange._full[0]) == _MAX_FULL_ROLLOUTS
     assert client.dropped > 0
 
 

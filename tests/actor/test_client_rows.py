@@ -1,6 +1,5 @@
 """ClientRows: what an interrupted loop leaves in its rollouts."""
 
-import copy
 from typing import Any
 
 import gymnasium
@@ -44,7 +43,7 @@ class Loop:
         self.rows = ClientRows(
             TRANSFORMS,
             writer,
-            on_full=lambda writer: self.rollouts.append(copy.deepcopy(writer.finish(IDENTITY, 0))),
+            on_full=lambda rows: self.rollouts.append(rows.finished_copy(0)),
             **arguments,
         )
         self.episode, self.step = 1, 0
@@ -142,7 +141,7 @@ def test_last_observation_of_an_episode_allows_every_choice() -> None:
         writer,
         example_mask=[True, False, False],
         bootstrap_terminations=False,
-        on_full=lambda writer: rollouts.append(copy.deepcopy(writer.finish(IDENTITY, 0))),
+        on_full=lambda rows: rollouts.append(rows.finished_copy(0)),
     )
     for _ in range(ROWS):
         rows.observe(np.zeros(2, np.float32), [False, True, True])
