@@ -144,7 +144,9 @@ def test_a_run_at_its_budget_has_nothing_to_train(run: Path) -> None:
 def test_a_run_that_reached_its_target_has_nothing_to_train(run: Path) -> None:
     end = finished(run, {}, **TARGET)
     assert end is not None
-    assert end.reason.startswith("the target return 10 was reached, and 5,000 env_steps are done: train on with --set")
+    assert end.reason.startswith(
+        "the target, mean return 10, was reached, and 5,000 env_steps are done: train on with --set"
+    )
     assert (end.missed, end.to_evaluate) == (False, True)
     assert finished(run, {"finished": False, "solved": False}, **TARGET) is None  # before new episodes confirmed it
     assert finished(run, {}, **TARGET, stop_when_solved=False) is None
@@ -163,7 +165,7 @@ def test_a_run_that_an_evaluation_solved_has_nothing_to_train(run: Path) -> None
     for budget in (5000, 9000):
         end = finished(run, {}, **target, algorithm="one_step_q", env_steps=budget)
         assert end is not None
-        assert end.reason.startswith("the target return 99 was reached")
+        assert end.reason.startswith("the target, mean return 99, was reached")
         assert not end.missed
     assert finished(run, {}, **target, env_steps=9000) is None  # actors that do not explore
 

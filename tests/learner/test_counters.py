@@ -105,10 +105,12 @@ def test_counters_of_an_earlier_release_are_restored() -> None:
 def test_target_has_to_be_reached_again_after_a_resume_where_it_is_another_or_ends_training(
     changed: dict[str, Any], kept: bool
 ) -> None:
-    before = TrainingSpec(stop_when_solved=False, target_return=5.0, target_episodes=3)
+    training = TrainingSpec(stop_when_solved=False, target_return=5.0, target_episodes=3)
+    before = run_spec().model_copy(update={"training": training})
+    after = before.model_copy(update={"training": training.model_copy(update=changed)})
     counters = RunCounters(3)
     counters.seconds_to_target = 1.5
-    counters.forget_target(before, before.model_copy(update=changed))
+    counters.forget_target(before, after)
     assert counters.seconds_to_target == (1.5 if kept else None)
 
 

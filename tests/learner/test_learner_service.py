@@ -193,7 +193,7 @@ def test_a_run_whose_actors_explore_is_solved_by_an_evaluation(
     assert json.loads((solved.directory / "summary.json").read_text())["solved"]
     finished = finished_run(solved.directory, solved.spec)
     assert finished is not None
-    assert finished.reason.startswith("the target return 1 was reached, and")
+    assert finished.reason.startswith("the target, mean return 1, was reached, and")
     assert not finished.missed
 
 
