@@ -4,8 +4,12 @@
 
 CartPole with the default settings and two honest actors. Early in the run a third one sends one rollout with
 observations of +-9e14, one with rewards of +-1e9, or 700 of the first kind, rejoining when it is quarantined; or, for
-half of the run, values a thousand times too large, which no quarantine ends. The run must reach 90 % of the return that
-it has without an attack. `make attack` does all of it in one run; the command above does each in a run of its own.
+half of the run, values a thousand times too large, which no quarantine ends. The policy at the end of the run must have
+95 % of the return that it has without an attack. `make attack` does all of it in one run; the command above does each
+in a run of its own.
+
+The newest policy plays new episodes with the actions that training samples. The return of training is no measure of it:
+the newest 100 episodes began up to 50,000 env_steps ago, during the attack.
 """
 
 import sys
@@ -17,11 +21,12 @@ import numpy as np
 
 from benchmarks.attack._hostile_actor import HostileActor
 from benchmarks.attack.verdict import Verdict
-from benchmarks.chaos.scene import Scene, read_json, scene
+from benchmarks.chaos.scene import Scene, scene
+from daedalus.launch.evaluation import evaluate
 
 _ENV_STEPS = 100_000
 _BEGIN, _END = 5_000, 50_000  # env_steps of the run, between which it is attacked
-_RETURN = 450.0  # 90 % of 500, the largest of CartPole: without an attack the newest 100 episodes have 460 to 500
+_RETURN = 475.0  # 95 % of 500, the largest of CartPole, which six runs without an attack had
 _MESSAGES = 700
 
 
@@ -39,7 +44,7 @@ def _attacked(attack: Callable[[HostileActor, Scene], object]) -> float:
         with closing(HostileActor(here.address, "hostile")) as hostile:
             attack(hostile, here)
         here.wait("the end", lambda: run.process.poll() is not None)
-        return read_json(here.folder / "run" / "summary.json")["episode_return_mean"]
+        return evaluate(here.folder / "run", newest=True, actions="sampled", episodes=100).return_mean
 
 
 def _signs(hostile: HostileActor) -> np.ndarray:

@@ -61,14 +61,15 @@ def seen(result):
 
 
 def run(folder: Path, program: str) -> dict[str, Any]:
-    """Run a program, and return what its last line has as JSON."""
+    """Run a program, and return what its only line has as JSON: all that it calls is quiet."""
     (folder / "program.py").write_text(BEGIN + textwrap.dedent(program))
     ended = subprocess.run(
         [sys.executable, "program.py"], cwd=folder, capture_output=True, text=True, timeout=LIMIT, check=False
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert not processes_mentioning(str(folder))
-    return json.loads(ended.stdout.splitlines()[-1])
+    (line,) = ended.stdout.splitlines()
+    return json.loads(line)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
