@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from daedalus.analysis.recorded_run import read_metrics
     from daedalus.launch.callbacks import Callback, TrainingRun
     from daedalus.launch.evaluation import EvaluationResult, evaluate
+    from daedalus.launch.match_evaluation import MatchScore, MatchScores
     from daedalus.launch.train_function import RunResult, TrainingError, resume, train
     from daedalus.learner.run.run_files import RunDataError
     from daedalus.learner.run.settings import SettingsError
@@ -35,6 +36,8 @@ __all__ = [
     "EnvironmentSetupError",
     "EvaluationResult",
     "HubError",
+    "MatchScore",
+    "MatchScores",
     "NoPolicyError",
     "Policy",
     "RunDataError",
@@ -59,6 +62,8 @@ _MODULES = {
     "EnvironmentSetupError": "daedalus.actor.environments.environment_errors",
     "EvaluationResult": "daedalus.launch.evaluation",
     "HubError": "daedalus.policy.saving.hub",
+    "MatchScore": "daedalus.launch.match_evaluation",
+    "MatchScores": "daedalus.launch.match_evaluation",
     "NoPolicyError": "daedalus.policy.saving.saved_policy",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
     "RunDataError": "daedalus.analysis.recorded_run",

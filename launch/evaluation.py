@@ -2,9 +2,6 @@
 
 import io
 import operator
-import os
-import re
-import sys
 import threading
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -15,7 +12,6 @@ import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.given_environment import giving
-from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import (
     Evaluation,
@@ -24,97 +20,26 @@ from daedalus.actor.evaluation.episodes import (
     environments_for,
     play_episodes,
 )
-from daedalus.actor.evaluation.video import FORMATS, Video
-from daedalus.launch.environment_object import NO_ENVIRONMENT, EnvironmentObject, environment_object
+from daedalus.actor.evaluation.video import Video
+from daedalus.launch.environment_object import environment_object
+from daedalus.launch.evaluation_options import (
+    EvaluationOptions,
+    actions_of,
+    check_spaces,
+    chosen_policy,
+    environment_of,
+    modules_of,
+)
+from daedalus.launch.match_evaluation import MatchScores, evaluated_matches
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import evaluation_result
-from daedalus.policy.saving.hub import pull
-from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy, pretrained
+from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of, refuse_while_imported
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, refuse_while_imported
 from daedalus.protocol.spec import Backend, EnvironmentSpec
 
 if TYPE_CHECKING:
     import gymnasium
-
-EPISODES = 100  # without a video or a window
-_MOST_EPISODES = 1_000_000  # their results are held in memory
-_WIDTHS = range(16, 4097)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluationOptions:
-    """Which policy to evaluate, and how; None: the default. Raises ValueError for options that cannot be used."""
-
-    directory: Path | None = None  # a run directory, or one of its checkpoints
-    pretrained: str | None = None  # the name of a policy of the package, in place of a directory
-    from_hub: str | None = None  # USER/NAME, in place of a directory
-    revision: str | None = None  # of `from_hub`
-    newest: bool = False  # the newest checkpoint of the run, not the best
-    episodes: int | None = None
-    seed: int | None = None
-    actions: str | None = None  # "greedy" or "sampled"
-    backend: Backend | None = None
-    envs: int | None = None  # environments that step together
-    wrap: str | None = None  # in place of environment.wrap; "none": no wrapper
-    allowed_modules: frozenset[str] = frozenset()
-    env: EnvironmentObject = NO_ENVIRONMENT  # that of the run, if it is passed again in Python
-    video: Path | None = None
-    width: int | None = None  # of the video
-    max_seconds: float | None = None  # of the video
-    render: bool = False  # in a window
-
-    @property
-    def watched(self) -> bool:
-        """Whether the episodes are shown or filmed, with one environment."""
-        return self.video is not None or self.render
-
-    @property
-    def count(self) -> int:
-        """Number of episodes."""
-        return self.episodes if self.episodes is not None else 1 if self.watched else EPISODES
-
-    def __post_init__(self) -> None:
-        watched = "--video" if self.video else "--render" if self.render else None
-        if sum(source is not None for source in (self.directory, self.pretrained, self.from_hub)) != 1:
-            raise ValueError(
-                "name either a run directory (or one of its checkpoints), or --pretrained NAME, or --from-hub USER/NAME"
-            )
-        if self.revision is not None and self.from_hub is None:
-            raise ValueError("--revision is that of a policy on the Hub: add --from-hub USER/NAME, or leave it out")
-        if not 1 <= self.count <= _MOST_EPISODES:
-            raise ValueError(f"--episodes is {self.count}: choose a number from 1 to {_MOST_EPISODES:,}")
-        if self.envs is not None and not 1 <= self.envs <= 4096:
-            raise ValueError(f"--envs is {self.envs}: choose a number from 1 to 4096")
-        if self.seed is not None and self.seed < 0:
-            raise ValueError(f"--seed is {self.seed}: choose 0 or more")
-        if self.wrap not in (None, "none") and re.fullmatch(r"\w+(\.\w+)*:\w+", self.wrap) is None:
-            raise ValueError(f"--wrap is {self.wrap}: write MODULE:FUNCTION, or none")
-        if self.video and self.video.suffix.lower() not in FORMATS:
-            raise ValueError(f"--video is {self.video}: the name must end with {' or '.join(FORMATS)}")
-        if self.video and self.render:
-            raise ValueError("--video and --render cannot be used together: run the command twice with the same --seed")
-        if not self.video and (self.width is not None or self.max_seconds is not None):
-            raise ValueError("--width and --max-seconds need --video FILE: add it, or leave them out")
-        if self.width is not None and self.width not in _WIDTHS:
-            raise ValueError(f"--width is {self.width}: choose a number from {_WIDTHS[0]} to {_WIDTHS[-1]}")
-        if self.max_seconds is not None and not self.max_seconds > 0:
-            raise ValueError(f"--max-seconds is {self.max_seconds:g}: choose a number above 0")
-        if watched and self.backend not in (None, "gymnasium"):
-            raise ValueError(f"{watched} needs gymnasium's implementation: leave out --backend {self.backend}")
-        if watched and self.envs not in (None, 1):
-            raise ValueError(f"{watched} shows one environment: leave out --envs {self.envs}")
-        if self.render and not _has_screen():
-            raise ValueError(
-                "--render needs a screen, and this machine has none: record the episodes with --video FILE.mp4"
-            )
-
-
-def _has_screen() -> bool:
-    if sys.platform != "linux":
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
 
 _SAME_IN_RESULT = (
     *("return_mean", "return_std", "environment", "backend"),
@@ -138,6 +63,7 @@ class EvaluationResult:
     best_checkpoint: bool  # whether the policy is the best checkpoint of its run
     video: Path | None  # the file that was recorded
     notes: tuple[str, ...]  # such as that episodes were cut
+    matches: MatchScores | None = None  # with `against`
 
 
 def evaluate(
@@ -155,6 +81,8 @@ def evaluate(
     video: str | Path | None = None,
     width: int | None = None,
     max_seconds: float | None = None,
+    against: str | Path | None = None,
+    openings: int = 0,
     allow_modules: Collection[str] = (),
 ) -> EvaluationResult:
     """Play new episodes with the policy of a run, and return their returns. Prints nothing.
@@ -174,6 +102,11 @@ def evaluate(
       video: record the episodes as this file, .mp4 or .gif, on gymnasium's implementation.
       width: of the video, in pixels.
       max_seconds: length of the video; the evaluation ends with it.
+      against: the opponent in a game with several agents: a run directory, one of its checkpoints, a version that the
+        run's league kept ("v120"), "random", "module:Bot", or USER/NAME on the Hub. The policy plays from every side in
+        turn, the opponent plays all others; an episode is a game (default: 200).
+      openings: number of random env_steps at the start of each game against an opponent. Two players without chance
+        play the same game again and again otherwise.
       allow_modules: modules that may be imported to make the run's environment. Importing a module runs it, and a file
         named it.
 
@@ -200,6 +133,8 @@ def evaluate(
         video=None if video is None else Path(video),
         width=_whole_number("width", width),
         max_seconds=max_seconds,
+        against=None if against is None else str(against),
+        openings=_whole_number("openings", openings) or 0,
         allowed_modules=frozenset({*allow_modules, *given.modules}),
         env=given,
     )
@@ -213,6 +148,7 @@ def evaluate(
         lengths=np.array(result["lengths"], np.int64),
         video=options.video,
         notes=tuple(result["notes"]),
+        matches=result.get("matches"),
         **{name: result[name] for name in _SAME_IN_RESULT},
     )
 
@@ -227,10 +163,10 @@ def _whole_number(name: str, value: object) -> int | None:
 
 def run_evaluation(options: EvaluationOptions, stop: threading.Event, stream: TextIO) -> dict[str, Any]:
     """Return the result of the evaluation that the options describe. `stream` shows its progress."""
-    policy = find_policy(_directory(options), options.newest)
+    policy = chosen_policy(options)
     trained = policy.spec.environment.id
-    if not options.env.is_for(trained):
-        raise ValueError(f"env is {options.env.id}, and the policy was trained on {trained}: leave env out")
+    if options.against is not None:
+        return evaluated_matches(policy, options, _seed(policy, options), stop, stream)
     if options.env.maker is not None:
         with giving(trained, options.env.maker):
             return _evaluated(policy, options, stop, stream)
@@ -240,9 +176,9 @@ def run_evaluation(options: EvaluationOptions, stop: threading.Event, stream: Te
 def _evaluated(
     policy: SavedPolicy, options: EvaluationOptions, stop: threading.Event, stream: TextIO
 ) -> dict[str, Any]:
-    spec, modules = _environment(policy, options), _modules(policy, options)
+    spec, modules = environment_of(policy, options), modules_of(policy, options)
     modules.check(spec.user_modules)
-    seed = policy.spec.training.seed + 2**32 if options.seed is None else options.seed
+    seed = _seed(policy, options)
     progress = EvaluationProgress(stream, options.count, policy.spec.evaluation.max_episode_env_steps, stop)
     filmed: dict[str, Any] = {}
     notes: list[str] = []
@@ -261,42 +197,13 @@ def _evaluated(
                 notes.append(f"the speed of the video: {video.rate.guess}")
     finally:
         progress.end()
-    actions = _actions(policy, options)
+    actions = actions_of(policy, options)
     result = _result(policy, spec, evaluation, actions)
     return {**result, "notes": [*result["notes"], *notes], "seed": seed, "actions": actions, **filmed}
 
 
-def _directory(options: EvaluationOptions) -> Path:
-    """Return the run directory or checkpoint that the options name. Raises HubError, NoPolicyError."""
-    if options.from_hub is not None:
-        return pull(options.from_hub, options.revision)
-    if options.pretrained is not None:
-        return pretrained(options.pretrained)
-    assert options.directory is not None
-    return options.directory
-
-
-def _environment(policy: SavedPolicy, options: EvaluationOptions) -> EnvironmentSpec:
-    """Return the environment to play: that of the training, on the backend of the evaluation."""
-    trained = policy.spec.environment
-    if options.wrap is not None:
-        trained = trained.model_copy(update={"wrap": None if options.wrap == "none" else options.wrap})
-    if options.watched:
-        return as_on_gymnasium(trained).model_copy(update={"processes": False})
-    return evaluated_environment(trained, options.backend or policy.spec.evaluation.final_backend or trained.backend)
-
-
-def evaluated_environment(trained: EnvironmentSpec, backend: Backend) -> EnvironmentSpec:
-    """Return the environment of an evaluation on a backend, of a policy trained in another one."""
-    played = as_on_gymnasium(trained) if backend == "gymnasium" else trained.as_evaluated(backend)
-    return played.model_copy(update={"processes": played.processes and backend == "gymnasium"})
-
-
-def _modules(policy: SavedPolicy, options: EvaluationOptions) -> UserModules:
-    """Return the modules that the command line allows, with that of its own --wrap."""
-    own = {module_of(options.wrap)} if options.wrap not in (None, "none") else set()
-    source = f"the run of {options.from_hub or policy.directory}"
-    return UserModules(frozenset({*options.allowed_modules, *own}), source)
+def _seed(policy: SavedPolicy, options: EvaluationOptions) -> int:
+    return policy.spec.training.seed + 2**32 if options.seed is None else options.seed
 
 
 def _play(
@@ -319,11 +226,7 @@ def _play(
         one_episode=True,
     )
     try:
-        if environments.spaces != policy.spaces:
-            raise EnvironmentSetupError(
-                f"{spec.id} (backend {spec.backend}) has {environments.spaces}; the policy was trained on "
-                f"{policy.spaces}: choose another --backend, or install the versions that the run used (versions.json)"
-            )
+        check_spaces(environments.spaces, spec, policy)
         runtime = OnnxRuntime(policy.program, progress.stop)
         runtime.load(policy.weights)
         return play_episodes(
@@ -331,16 +234,12 @@ def _play(
             environments,
             episodes,
             seed,
-            sampled=_actions(policy, options) == "sampled",
+            sampled=actions_of(policy, options) == "sampled",
             longest=policy.spec.evaluation.max_episode_env_steps,
             progress=lambda finished, mean: progress(finished, mean) or (video is not None and video.is_full),
         )
     finally:
         environments.close()
-
-
-def _actions(policy: SavedPolicy, options: EvaluationOptions) -> str:
-    return options.actions or policy.spec.evaluation.actions
 
 
 def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation, actions: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.messages import Snapshot
-from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, LeagueSpec, RunSpec
+from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, EvaluationSpec, LeagueSpec, RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
@@ -28,10 +28,12 @@ def started_collector(
     environments: VectorEnvironment | None = None,
     modules: UserModules = TEST_MODULES,
     league: LeagueSpec | None = None,
+    longest: int = 27_000,
 ) -> EnvironmentCollector:
     """A collector at the start of its first rollout; it steps `environments` instead of its own if they are given."""
     collection = CollectionSpec(envs_per_actor=count, rollout_length=rollout_length)
-    run = RunSpec(environment=spec, collection=collection, league=league or LeagueSpec())
+    evaluation = EvaluationSpec(max_episode_env_steps=longest)
+    run = RunSpec(environment=spec, collection=collection, evaluation=evaluation, league=league or LeagueSpec())
     collector = EnvironmentCollector(modules=modules)
     if environments is None:
         collector.prepare(run.for_actors())

@@ -77,7 +77,11 @@ class EnvironmentCollector:
         games = make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league))
         try:
             self.lineup = Lineup(
-                spec.league, games, count, lambda name: make_bot(name, games.action_space, self._modules)
+                spec.league,
+                games,
+                count,
+                lambda name: make_bot(name, games.action_space, self._modules),
+                spec.evaluation.max_episode_env_steps,
             )
             self._environments = TransformedEnvironment(games, spec.environment)
         except EnvironmentSetupError:

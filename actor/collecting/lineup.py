@@ -4,6 +4,7 @@ A copy of a game plays matches of one kind: the newest policy in all seats; the 
 opponent on all others; or any two players, only to rate them. docs/wire.md ("Games") says what is reported of them.
 """
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -22,6 +23,9 @@ from daedalus.protocol.spec import LeagueSpec
 _PAST_SHARE = 0.2  # of the matches of a game with opponents, unless it is set
 _MOST_POLICIES = 32  # of opponents; beyond it the one that was chosen longest ago is forgotten
 _NEWEST, _BOT = 0, -1  # players of seats; policies of opponents have numbers from 1
+
+
+_logger = logging.getLogger(__name__)
 
 
 class Match(NamedTuple):
@@ -49,6 +53,15 @@ def sides_of(league: LeagueSpec, agents: Sequence[str]) -> tuple[tuple[int, ...]
     return sides
 
 
+def outcome(means: Sequence[float], side: int) -> int:
+    """Return 0 if a side has won a match, 1 for a draw, 2 if it has lost: against the best of the other sides.
+
+    `means`: of the returns of each side's agents.
+    """
+    own, best = means[side], max(mean for other, mean in enumerate(means) if other != side)
+    return 1 if math.isclose(own, best, rel_tol=1e-9, abs_tol=1e-9) else 0 if own > best else 2
+
+
 def rating_copies(league: LeagueSpec, agents: Sequence[str]) -> int:
     """Return how many copies of a game only rate players, besides those that are learned from."""
     return 1 if league.rating_share > 0.0 and len(sides_of(league, agents)) > 1 else 0
@@ -72,7 +85,12 @@ class Lineup:
     """
 
     def __init__(
-        self, league: LeagueSpec, games: GameEnvironments, copies: int, make_bot: Callable[[str], Bot]
+        self,
+        league: LeagueSpec,
+        games: GameEnvironments,
+        copies: int,
+        make_bot: Callable[[str], Bot],
+        longest: int,
     ) -> None:
         """Construct the lineup; call `begin` before the games are reset.
 
@@ -81,6 +99,7 @@ class Lineup:
           games: the copies of the game: those that are learned from, and then those that only rate.
           copies: how many are learned from.
           make_bot: returns a new object that plays one seat, for a fixed opponent that is code.
+          longest: number of steps after which a match that only rates is abandoned.
 
         Raises EnvironmentSetupError if the settings do not fit the game.
         """
@@ -103,6 +122,8 @@ class Lineup:
         self._bots: dict[tuple[str, int], Bot] = {}  # by name and seat
         self._policies: dict[str, _OpponentPolicy] = {}  # the one that was chosen longest ago first
         self._counts: dict[Match, list[int]] = {}
+        self._longest, self._steps = longest, np.zeros(self._copies, np.int64)  # in the match of each copy
+        self._warned = False  # of an abandoned match
         self._played, self._rated = 0, 0  # matches
         self._opponent, self._left = NEWEST, 0  # of the next matches, and how many of them
         fixed = {name: weight for name, weight in league.opponents.items() if weight and is_bot(name)}
@@ -212,7 +233,7 @@ class Lineup:
             match = self._current[copy] = self._next[copy]
             first = copy * self._seats
             seats = np.arange(first, first + self._seats)
-            self._scores[seats] = 0.0
+            self._scores[seats], self._steps[copy] = 0.0, 0
             self.column[seats] = -1
             for side, members in enumerate(self._sides):
                 player = NEWEST if match is None else match.first if side == match.side else match.second
@@ -270,8 +291,8 @@ class Lineup:
             noise = Noise(*(np.where(greedy[:, None], *pair) for pair in zip(neutral, noise, strict=True)))
         return noise
 
-    def step(self, acted: np.ndarray, rewards: np.ndarray, ended: Sequence[int]) -> None:
-        """Count what a step brought.
+    def step(self, acted: np.ndarray, rewards: np.ndarray, ended: Sequence[int]) -> list[int]:
+        """Count what a step brought, and return copies whose match is abandoned.
 
         Args:
           acted: [seats] bool, whether the reward belongs to an action of this match.
@@ -287,6 +308,28 @@ class Lineup:
             if not rates:
                 self._choose(copy)
             self._let_rate()
+        return self._abandoned()
+
+    def _abandoned(self) -> list[int]:
+        """Abandon the matches that only rate and do not end."""
+        abandoned = []
+        self._steps[self._learned :] += 1
+        for copy in range(self._learned, self._copies):
+            if self._steps[copy] <= self._longest or self._games.is_over(copy):
+                continue
+            if not self._warned:
+                self._warned = True
+                _logger.warning(
+                    "a match of %s and %s, which only rates them, is abandoned without a result: it did not end in %s "
+                    "steps (evaluation.max_episode_env_steps)",
+                    *((NEWEST, NEWEST) if (match := self._current[copy]) is None else (match.first, match.second)),
+                    f"{self._longest:,}",
+                )
+            self._games.abandon(copy)
+            self._rated += 1  # the next one begins when its turn comes
+            self._let_rate()
+            abandoned.append(copy)
+        return abandoned
 
     def _let_rate(self) -> None:
         """Let the copies that rate play as many matches as the settings say, and rest in between."""
@@ -305,10 +348,7 @@ class Lineup:
             return
         first = copy * self._seats
         means = [float(self._scores[first + members].mean()) for members in self._sides]
-        own = means.pop(match.side)
-        best = max(means)
-        result = 1 if math.isclose(own, best, rel_tol=1e-9, abs_tol=1e-9) else 0 if own > best else 2
-        self._counts.setdefault(match, [0, 0, 0])[result] += 1
+        self._counts.setdefault(match, [0, 0, 0])[outcome(means, match.side)] += 1
 
     def take_matches(self) -> Matches | None:
         """Return the results since the last call; None if no match ended."""

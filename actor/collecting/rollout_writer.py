@@ -65,6 +65,10 @@ class EpisodeCounter:
             self._lengths[ended] = 0
         self.ended = np.where(acted, ended, self.ended)
 
+    def abandon(self, seats: slice) -> None:
+        """Forget the running episodes of seats, whose next step is a reset."""
+        self._returns[seats], self._lengths[seats], self.ended[seats] = 0.0, 0, True
+
     def cut(self) -> None:
         """Note that all episodes ended with the row that was counted last."""
         self._finished.append((self._returns.copy(), self._lengths.copy()))
@@ -405,9 +409,12 @@ class SeatWriter(RolloutWriter):
         self._show(observed)
         rewards = rewards.astype(np.float32)
         counted = self._lineup.column >= 0
-        self._lineup.step(acted & ~resets, rewards, np.flatnonzero(observed.over & ~was_over).tolist())
+        abandoned = self._lineup.step(acted & ~resets, rewards, np.flatnonzero(observed.over & ~was_over).tolist())
         # Also those that are not written: the agents who act most often would have too few results in the mean.
         self._episodes.step_seats(acted, rewards, terminated | truncated, counted)
+        for copy in abandoned:
+            self._over[copy] = True
+            self._episodes.abandon(slice(copy * self._seats, (copy + 1) * self._seats))
         return bool((self._rows == len(self._rewards)).all())
 
     def finish(

@@ -82,6 +82,7 @@ class GameEnvironments:
         self._acts = np.zeros(self.count, np.bool_)  # whether the seat has acted in this match
         self._warned = False
         self.resting = np.zeros(len(copies), np.bool_)  # copies that do not begin another match
+        self._abandoned = np.zeros(len(copies), np.bool_)  # copies whose match goes on, but not here
         self._episode_info = EpisodeInfo()
         self._camera: Camera | None = None
         self.acting = np.zeros(self.count, np.bool_)
@@ -92,11 +93,17 @@ class GameEnvironments:
     @property
     def over(self) -> np.ndarray:
         """Whether the match of each copy has ended, [copies] bool."""
-        return np.array([game.is_over for game in self._games])
+        return self._abandoned | [game.is_over for game in self._games]
 
     def is_over(self, copy: int) -> bool:
         """Return whether the match of a copy has ended."""
-        return self._games[copy].is_over
+        return bool(self._abandoned[copy]) or self._games[copy].is_over
+
+    def abandon(self, copy: int) -> None:
+        """End the match of a copy without a result: its next step is a reset, unless it rests."""
+        self._abandoned[copy] = True
+        seats = slice(copy * self.seats, (copy + 1) * self.seats)
+        self._ended[seats], self._acts[seats] = True, False
 
     def seat_bot(self, seat: int, bot: Bot | None) -> None:
         """Let a bot choose the actions of a seat from the next match of its copy on; None: the caller chooses them.
@@ -117,6 +124,7 @@ class GameEnvironments:
         return self.observations
 
     def _begin_match(self, number: int) -> None:
+        self._abandoned[number] = False
         for agent, place in self._numbers.items():
             seat = number * self.seats + place
             bot = self._in_match[seat] = self._bots[seat]
@@ -130,7 +138,7 @@ class GameEnvironments:
         acted, self.acting = self.acting, np.zeros(self.count, np.bool_)
         self._acts |= acted & ~self._ended
         for number, game in enumerate(self._games):
-            if game.is_over:
+            if self._abandoned[number] or game.is_over:
                 if self.resting[number]:
                     continue
                 self._begin_match(number)

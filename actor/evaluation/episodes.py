@@ -111,8 +111,8 @@ def _repeated(rows: np.ndarray, repeats: int) -> np.ndarray:
 
 
 _MAX_ENVIRONMENTS = 100
-_SEEDS = 2**30  # seeds of environments are below it plus the number of episodes: every backend takes them
-_LONGEST = EvaluationSpec().max_episode_env_steps
+SEEDS = 2**30  # seeds of environments are below it plus the number of episodes: every backend takes them
+LONGEST = EvaluationSpec().max_episode_env_steps
 PROGRESS_SECONDS = 5.0  # between two lines
 _ENVIRONMENTS_PER_PROCESSOR = 4  # if each is a process: enough to keep a processor busy, and few enough to start fast
 
@@ -197,7 +197,7 @@ def play_episodes(
     seed: int,
     *,
     sampled: bool,
-    longest: int = _LONGEST,
+    longest: int = LONGEST,
     progress: Callable[[int, float], bool] = no_progress,
 ) -> Evaluation:
     """Play `episodes` episodes and return their results, in the order of their numbers.
@@ -225,8 +225,8 @@ def play_episodes(
     results = _Results(episodes)
     seats = environments.seats
     for first in range(0, episodes, environments.count // seats):
-        random = _EpisodeNoise(runtime.noise_size, action_seed, first * seats, _rows(environments.count), sampled)
-        observed = environments.reset(environment_seed % _SEEDS + first)  # environment e gets this seed + e
+        random = EpisodeNoise(runtime.noise_size, action_seed, first * seats, environments.count, sampled)
+        observed = environments.reset(environment_seed % SEEDS + first)  # environment e gets this seed + e
         if not _play_round(runtime, environments, observed, random, first, results, longest, progress):
             break
     played = results.lengths > 0
@@ -248,10 +248,15 @@ def _refuse_unfit_returns(returns: np.ndarray) -> None:
         )
 
 
-class _EpisodeNoise:
-    """The noise of a round: row e draws from the generator of episode `first` + e; neutral if not sampled."""
+class EpisodeNoise:
+    """The noise of a round: row e draws from the generator of episode `first` + e; neutral if not sampled.
 
-    def __init__(self, size: NoiseSize, seed: int, first: int, rows: int, sampled: bool) -> None:
+    A single row is computed twice, as a batch of two: for a batch of one, matrix products use another kernel, which
+    rounds differently.
+    """
+
+    def __init__(self, size: NoiseSize, seed: int, first: int, count: int, sampled: bool) -> None:
+        rows = max(count, 2)
         self._size, self._neutral = size, None if sampled else neutral_noise(size, rows)
         self._generators = [np.random.default_rng([seed, first + row]) for row in range(rows)]
 
@@ -280,7 +285,7 @@ def _play_round(
     runtime: PolicyRuntime,
     environments: VectorEnvironment,
     observed: Observed,
-    random: _EpisodeNoise,
+    random: EpisodeNoise,
     first: int,
     results: _Results,
     longest: int,
@@ -315,12 +320,3 @@ def _play_round(
         if not playing.any():
             break
     return True
-
-
-def _rows(count: int) -> int:
-    """Return the number of rows of the policy's batches for `count` environments.
-
-    A single row is computed twice, as a batch of two: for a batch of one, matrix products use another kernel, which
-    rounds differently.
-    """
-    return max(count, 2)

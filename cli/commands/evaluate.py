@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn, TextIO, get_args
 
@@ -14,8 +15,10 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episodes import EvaluationStoppedError
 from daedalus.actor.evaluation.video import VideoError
 from daedalus.cli.arguments import add_allow_module, add_logging, allowing, command_parser
-from daedalus.launch.evaluation import EPISODES, EvaluationOptions, run_evaluation
+from daedalus.launch.evaluation import run_evaluation
+from daedalus.launch.evaluation_options import EPISODES, GAMES, EvaluationOptions
 from daedalus.launch.logs import configure_logging, print_error, say
+from daedalus.launch.match_evaluation import MatchScores
 from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
@@ -29,7 +32,7 @@ from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError
 from daedalus.protocol.spec import Backend
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.texts import bounded_text, short_number
 
 _FAILURES = (
     EvaluationStoppedError,
@@ -41,6 +44,8 @@ _FAILURES = (
     VideoError,
 )
 
+
+_SIDE_WIDTH = 30
 
 DESCRIPTION = """\
 Plays new episodes with the policy of a run and reports their returns, with unscaled rewards. By default it uses the
@@ -56,6 +61,8 @@ examples:
   daedalus evaluate RUN_DIR --backend gymnasium --episodes 100
   daedalus evaluate RUN_DIR --video drive.gif --max-seconds 20
   daedalus evaluate RUN_DIR --render
+  daedalus evaluate RUN_DIR --against random
+  daedalus evaluate RUN_DIR --against my_players:Minimax --games 1000 --openings 4
   daedalus evaluate --from-hub USER/NAME --revision main
   daedalus evaluate RUN_DIR --allow-module corridor      (the run plays corridor:Corridor-v0)
 
@@ -82,9 +89,10 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--newest", action="store_true", help="use the newest checkpoint of the run, not the best")
     options.add_argument(
         "--episodes",
+        "--games",
         type=int,
         metavar="N",
-        help=f"number of episodes (default: {EPISODES}, or 1 with --video or --render)",
+        help=f"number of episodes (default: {EPISODES}; 1 with --video or --render; {GAMES} with --against)",
     )
     options.add_argument(
         "--seed", type=int, metavar="S", help="seed of the environments (default: a seed that training did not use)"
@@ -120,9 +128,30 @@ def parser() -> argparse.ArgumentParser:
         help="keep the result in the run directory, as the evaluation that report, compare and push show "
         "(evaluation.json)",
     )
+    _add_opponent(options)
     _add_watching(options)
     add_logging(options)
     return options
+
+
+def _add_opponent(options: argparse.ArgumentParser) -> None:
+    """Add the options for games with several agents."""
+    opponent = options.add_argument_group("games with several agents")
+    opponent.add_argument(
+        "--against",
+        metavar="OPPONENT",
+        help="play games against a run directory or checkpoint, a kept version of the run (v120), random, module:Bot "
+        "for your own, or USER/NAME on the Hub. The policy plays from every side in turn, and win, draw and loss are "
+        "counted",
+    )
+    opponent.add_argument(
+        "--openings",
+        type=int,
+        default=0,
+        metavar="K",
+        help="begin each game with K random moves: two players without chance play one game only otherwise (default: "
+        "0)",
+    )
 
 
 def _add_watching(options: argparse.ArgumentParser) -> None:
@@ -183,7 +212,7 @@ def main(
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print_error("evaluate", "stopped" if stop.is_set() else error)
         return 1
-    say(json.dumps(result) if arguments.json else _text(result), output)
+    say(json.dumps(result, default=asdict) if arguments.json else _text(result), output)
     return 0 if not arguments.record or _record(result, arguments.directory) else 1
 
 
@@ -191,6 +220,8 @@ def evaluation_options(arguments: argparse.Namespace) -> EvaluationOptions:
     """Return what the command line asks for. Raises ValueError for options that cannot be used."""
     if arguments.record and arguments.directory is None:
         raise ValueError("--record keeps the result in a run directory: name the directory of a run")
+    if arguments.record and arguments.against is not None:
+        raise ValueError("--record keeps episodes of the policy alone: leave it out, or --against")
     if arguments.record and arguments.max_seconds is not None:
         raise ValueError("--record keeps whole episodes, and --max-seconds cuts them: use one of the two")
     return EvaluationOptions(
@@ -210,6 +241,8 @@ def evaluation_options(arguments: argparse.Namespace) -> EvaluationOptions:
         width=arguments.width,
         max_seconds=arguments.max_seconds,
         render=arguments.render,
+        against=arguments.against,
+        openings=arguments.openings,
     )
 
 
@@ -243,9 +276,12 @@ def _reserved_stdout() -> TextIO:
 
 
 def _text(result: dict[str, Any]) -> str:
+    scores: MatchScores | None = result.get("matches")
     best = "best checkpoint, " if result["best_checkpoint"] else ""
     if is_best_in_training(Path(result["checkpoint"])):
         best = "best checkpoint by its training episodes, "
+    if scores is not None:
+        return "\n".join([*_lines_of(scores, result, best), *result["notes"]])
     text = (
         f"{result['environment']} (backend {result['backend']}), {best}policy version {result['policy_version']}: "
         f"return {short_number(result['return_mean'])} +- {short_number(result['return_std'])} "
@@ -255,6 +291,36 @@ def _text(result: dict[str, Any]) -> str:
     if "video" in result:
         text += f"\nvideo: {result['video']}, {result['video_seconds']:.1f} s"
     return "\n".join([text, *result["notes"]])
+
+
+def _lines_of(scores: MatchScores, result: dict[str, Any], best: str) -> list[str]:
+    """Return the results against an opponent as a table."""
+    version = "" if scores.opponent_version is None else f" (policy version {scores.opponent_version})"
+    openings = f", each after {scores.openings} random moves" if scores.openings else ""
+    rows = [("side", "games", "win", "draw", "loss", "return", "opponent's")]
+    rows += [
+        (
+            bounded_text(", ".join(score.agents), _SIDE_WIDTH) or "all",
+            str(score.games),
+            _percent(score.wins, score.games, score.win_interval),
+            _percent(score.draws, score.games, score.draw_interval),
+            _percent(score.losses, score.games, score.loss_interval),
+            short_number(score.return_mean),
+            short_number(score.opponent_return_mean),
+        )
+        for score in (*scores.sides, scores.total)
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        f"{result['environment']}, {best}policy version {result['policy_version']}, against {scores.opponent}"
+        f"{version}: {scores.total.games} {result['actions']} games{openings}, seed {result['seed']}",
+        *("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows),
+        f"in brackets: Wilson's interval at 95 %; distinct games: {scores.distinct_games}",
+    ]
+
+
+def _percent(count: int, games: int, interval: tuple[float, float]) -> str:
+    return f"{100 * count / games:.1f} % ({100 * interval[0]:.1f} to {100 * interval[1]:.1f})"
 
 
 def run_process() -> NoReturn:

@@ -334,6 +334,8 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
         f"on {evaluation['environment']} (backend {evaluation['backend']})"
     )
+    if "matches" in evaluation:
+        evaluated = f"evaluation of the newest checkpoint, {evaluation['actions']} actions: {evaluation['summary']}"
     return "\n".join([trained, *_confirmed(run, summary), evaluated, *evaluation["notes"]])
 
 

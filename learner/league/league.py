@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 _PLAN_SECONDS = 5.0  # between two plans that differ in the weights only
 _KEEP_PARTS = 50  # of the budget, after each of which a version is kept by default
 _CACHED_BYTES = 64 << 20  # of encoded snapshots: all actors ask for a new version at about the same time
-_SHOWN_PLAYERS, _SHOWN_SCORES = 48, 256  # in a status, which has limits
 
 _logger = logging.getLogger(__name__)
 
@@ -290,4 +289,4 @@ class League:
         with self._lock:
             if not self._began or self._ratings is None:
                 return None
-            return self._ratings.status(_SHOWN_PLAYERS, _SHOWN_SCORES)
+            return self._ratings.status()

@@ -241,6 +241,30 @@ def test_games_are_the_same_without_pettingzoo_s_checks(fields: dict[str, Any]) 
             np.testing.assert_array_equal(values, same)
 
 
+def test_a_match_that_only_rates_and_does_not_end_is_abandoned(caplog: pytest.LogCaptureFixture) -> None:
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": "endless"})
+    modules, league = UserModules(frozenset({"test_games"})), LeagueSpec(past_share=0.0, rating_share=0.5)
+    collector = started_collector(
+        spec, Always(1), count=2, rollout_length=12, league=league, modules=modules, longest=10
+    )
+    lineup = collector.lineup
+    assert lineup is not None
+    lineup.add_policy("v1", Always(0))  # the match ends when red takes 1
+    pairs = (("v1", "v2"), ("newest", "random"))
+    lineup.plan = Plan(rating=tuple(PlannedRating(first=one, second=two, weight=0.5) for one, two in pairs))
+    lineup.add_policy("v2", Always(0))
+    players = set()
+    for _ in range(30):
+        rollout = collect(collector)
+        assert (rollout.actions["action"][rollout.valid] == 1).all()
+        counts = rollout.matches.counts if rollout.matches is not None else ()
+        players |= {(each.first, each.second) for each in counts}
+    collector.close()
+    assert players == {("newest", "random")}
+    warnings = [record for record in caplog.records if "is abandoned without a result" in record.message]
+    assert len(warnings) == 1
+
+
 def make(problem: str = "", **fields: Any) -> EnvironmentReport:
     """Check a game of this module, with a fault."""
     spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": problem}, **fields)
@@ -268,7 +292,7 @@ class Duel(ParallelEnv):
         if self.problem == "raises":
             raise RuntimeError("the table broke")
         self.left -= 1
-        here, over = self.agents, self.left == 0
+        here, over = self.agents, self.left <= 0 and (self.problem != "endless" or actions["red"] == 1)
         rewards = {agent: float(actions[agent]) if self.problem != "reward" else np.nan for agent in here}
         self.agents = [] if over else here
         return self._seen(), rewards, dict.fromkeys(here, over), dict.fromkeys(here, False), self._info()
@@ -279,7 +303,7 @@ class Duel(ParallelEnv):
         return {agent: np.full(self.observation_space(agent).shape[0] + more, 0.5, np.float32) for agent in agents}
 
     def _info(self) -> dict[str, dict]:
-        if self.problem == "free":
+        if self.problem in ("free", "endless"):
             return {agent: {} for agent in self.possible_agents}
         mask = np.array([0, 0 if self.problem == "no choice" and self.left < 5 else 1], np.int8)
         return {agent: {"action_mask": mask} for agent in self.possible_agents}

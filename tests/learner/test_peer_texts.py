@@ -5,11 +5,13 @@ from dataclasses import replace
 import pytest
 from building import ENVIRONMENTS, EPOCH, SPACES, identity, joined_fleet, make_rollout, run_context, run_spec
 
+from daedalus.learner.league.ratings import Ratings
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import JoinResponses, page, totals
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.league import LeagueStatus, MatchCount
 from daedalus.protocol.limits import STATUS_LIMITS, Limits
 from daedalus.protocol.messages import (
     PAGE_ACTORS,
@@ -55,6 +57,18 @@ def test_the_reason_of_a_quarantine_is_bounded_and_printable() -> None:
     assert fleet._former["a", 1].quarantined == reason
 
 
+def largest_league() -> LeagueStatus:
+    fixed = [f"{FACE * 190}:{number}" for number in range(30)]
+    ratings = Ratings(["random", *fixed])
+    for version in range(100):
+        ratings.keep(10**17 + version)
+    players = ratings.players[:60]
+    pairs = [(first, second) for first in players for second in players if first < second]
+    counts = [MatchCount(purpose="rating", first=one, second=two, side=0, wins=1) for one, two in pairs]
+    ratings.add(counts, rate_training=True)
+    return ratings.status()
+
+
 def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
     names = [f"a.{number:02d}".ljust(64, "x") for number in range(PAGE_ACTORS)]
     context = run_context()
@@ -82,6 +96,7 @@ def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
         refused_joins=fleet.refused_joins.report(1.0),
         actors=actors,
         **totals(fleet),
+        league=largest_league(),
     )
     for message in (
         StatusReport(status=status),
