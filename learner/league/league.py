@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daedalus.learner.league.opponent_runs import opponent_run
-from daedalus.learner.league.ratings import LeagueState, Ratings, version_of
+from daedalus.learner.league.ratings import LeagueState, Ratings
 from daedalus.learner.league.versions import KeptVersion, VersionFolder, encoded, thinned
 from daedalus.learner.run.resuming import other_spaces
 from daedalus.learner.run.run_directory import LEAGUE
@@ -30,7 +30,7 @@ from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.saving.sealed import DamagedError, UnreadableError
 from daedalus.protocol.codec import encode
-from daedalus.protocol.league import DEFAULT_PAST_SHARE, LeagueStatus, Matches, Plan, is_bot, version_name
+from daedalus.protocol.league import DEFAULT_PAST_SHARE, LeagueStatus, Matches, Plan, is_bot, version_name, version_of
 from daedalus.protocol.messages import LeaguePlan, Program, Refusal, Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec

@@ -6,9 +6,8 @@ win. One player is the zero of the scale: `random`, or else the first kept versi
 """
 
 import math
-import re
 from collections import OrderedDict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import TYPE_CHECKING
@@ -24,6 +23,7 @@ from daedalus.protocol.league import (
     RatedPlayer,
     Score,
     version_name,
+    version_of,
 )
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spec import LeagueSpec
@@ -42,17 +42,8 @@ _PRIOR = 10.0  # matches that the ratings count for, beside the results of a pai
 _MOST_UPDATES = 400  # of ratings, by the results in one rollout: it takes 10 ms
 _MOST_RETIRED = 512  # players that are gone, whose matches may still end
 _RATING_PAIRS = 16  # beside the newest policy against each fixed opponent
-_PLAYERS_BYTES, _SCORES_BYTES = 6 << 10, 36 << 10  # in a status; 80 versions, and all pairs of 20
 _CONFIDENT = 100.0  # recent matches, from which a win rate counts as measured
 _Z = NormalDist().inv_cdf(0.975)
-
-_VERSION = re.compile(r"v(0|[1-9]\d{0,18})", re.ASCII)
-
-
-def version_of(player: str) -> int | None:
-    """Return the policy version that a player is, or None if it is none."""
-    match = _VERSION.fullmatch(player)
-    return None if match is None else int(match[1])
 
 
 def _order(player: str) -> tuple[int, int, str]:
@@ -325,42 +316,20 @@ class Ratings:
 
     def state(self) -> LeagueState:
         """Return everything that a checkpoint keeps."""
-        return LeagueState(
-            players=tuple(_rated(player, self._skills[player]) for player in self.players),
-            retired=tuple(_rated(player, skill) for player, skill in self._retired.items()),
-            scores=tuple(self._scores(self._results)),
-        )
+        status = self.status()
+        retired = tuple(_rated(player, skill) for player, skill in self._retired.items())
+        return LeagueState(players=status.players, retired=retired, scores=status.scores)
 
     def status(self) -> LeagueStatus:
-        """Return the ratings and results for people; of a very large league a part, because a status has limits.
-
-        Every other version is left out, and of pairs those without the newest policy that have played least.
-        """
-        players = self.players
-        while sum(map(_bytes, players)) > _PLAYERS_BYTES:
-            inner = [name for name in players if version_of(name) is not None][1:-1:2]
-            gone = {*(inner or players[-1:])}
-            players = [name for name in players if name not in gone]
-        shown, scores, size = {*players}, [], 0
-        pairs = {pair: results for pair, results in self._results.items() if shown.issuperset(pair)}
-        for pair in sorted(pairs, key=lambda each: (each[0] != NEWEST, -pairs[each].matches)):
-            size += _bytes(pair[0]) + _bytes(pair[1])
-            if size <= _SCORES_BYTES:
-                scores.append(pair)
+        """Return the ratings and results for people."""
+        pairs = sorted(self._results.items(), key=lambda item: (_order(item[0][0]), _order(item[0][1])))
         return LeagueStatus(
-            players=tuple(_rated(player, self._skills[player]) for player in players),
-            scores=tuple(self._scores(scores)),
+            players=tuple(_rated(player, self._skills[player]) for player in self.players),
+            scores=tuple(
+                Score(first=first, second=second, wins=results.wins, draws=results.draws, losses=results.losses)
+                for (first, second), results in pairs
+            ),
         )
-
-    def _scores(self, pairs: Iterable[tuple[str, str]]) -> Iterator[Score]:
-        for first, second in sorted(pairs, key=lambda pair: (_order(pair[0]), _order(pair[1]))):
-            results = self._results[first, second]
-            yield Score(first=first, second=second, wins=results.wins, draws=results.draws, losses=results.losses)
-
-
-def _bytes(player: str) -> int:
-    """Return how much a player takes in a status, at most: its name and its numbers."""
-    return len(player.encode()) + 64
 
 
 def _rated(player: str, skill: _Skill) -> RatedPlayer:

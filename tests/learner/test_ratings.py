@@ -121,7 +121,10 @@ def test_rating_matches_are_those_that_tell_most() -> None:
     plan = {(each.first, each.second): each.weight for each in ratings.rating_plan(["random"])}
     others = {pair: weight for pair, weight in plan.items() if pair != (NEWEST, "random")}
     assert plan[NEWEST, "random"] >= 0.5  # people look at it
-    assert all("v11" in pair or NEWEST in pair or "random" in pair for pair in sorted(others, key=others.get)[-3:])
+    assert all(
+        "v11" in pair or NEWEST in pair or "random" in pair
+        for pair in sorted(others, key=lambda pair: others[pair])[-3:]
+    )
     unequal = Ratings(["random", "a:Strong"])
     played(unequal, "a:Strong", "random", 380, 0, 20)
     unequal.keep(0)
@@ -228,18 +231,6 @@ def test_no_result_is_lost_and_plans_have_players_of_the_league_only(
     assert {name for each in rating for name in (each.first, each.second)} <= {*ratings.players}
     assert all(each.first != each.second for each in rating)
     assert sum(each.weight for each in rating) == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_status_of_a_very_large_league_has_a_part_of_the_players() -> None:
-    ratings = Ratings(["random", "a:B"])
-    for version in range(200):
-        ratings.keep(version)
-        played(ratings, f"v{version}", NEWEST, 1, 0, 0)
-        played(ratings, f"v{version}", "random", 3, 0, 0)
-    status = ratings.status()
-    assert 40 < len(status.players) < 100
-    assert [status.players[index].player for index in (0, 1, -3, -2, -1)] == [NEWEST, "v0", "v199", "a:B", "random"]
-    assert {name for each in status.scores for name in (each.first, each.second)} <= {p.player for p in status.players}
 
 
 @given(st.lists(st.integers(1, 50), min_size=1, max_size=80), st.integers(1, 12))
