@@ -1,6 +1,7 @@
 """Opponents of known strength for board games, as bots.
 
-    daedalus evaluate RUN --against benchmarks.game_opponents:PerfectTicTacToe --allow-module benchmarks.game_opponents
+    daedalus evaluate RUN --against benchmarks.game_opponents:PerfectTicTacToe --games 1000
+    daedalus evaluate RUN --against benchmarks.game_opponents:ConnectFourDepth4 --openings 4
 
 `PerfectTicTacToe` takes one of the best moves of the solved game. The Connect Four players search a fixed number of
 moves ahead; a position without a forced end within these moves is worth nothing to them. All draw uniformly from moves

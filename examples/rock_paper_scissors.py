@@ -1,11 +1,13 @@
 """Rock, paper, scissors: a game in which the newest policy forgets what it beat.
 
     daedalus train --env rock_paper_scissors:RockPaperScissors --set environment.backend=pettingzoo \
-        --set training.entropy_bonus=0 --set training.entropy_bonus_final=none --env-steps 200000
+        --set training.entropy_bonus=0 --set training.entropy_bonus_final=none --set league.past_share=0 \
+        --set league.rating_share=0.2 --env-steps 120000
 
 Without a bonus for entropy, a policy that only meets itself goes round in a circle: from rock to paper, from paper to
-scissors, from scissors to rock. The matrix of its versions shows that each beats some of the older ones and loses to
-others, so that no rating tells them apart. With past versions among the opponents, each of them must be answered.
+scissors, from scissors to rock, until it no longer tries anything else. The matrix of its versions shows that each
+beats some of the others and loses to some, so that no rating tells them apart. With past versions among the opponents
+(leave out league.past_share), the policy must answer each of them.
 """
 
 from typing import Any
