@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daedalus.analysis.comparison import final_returns, incomparable_returns, training_tasks
-from daedalus.analysis.learning_curves import STD, Series, series_of
-from daedalus.analysis.recorded_run import RETURN
+from daedalus.analysis.learning_curves import STD, Series, series_of, title_of
+from daedalus.analysis.recorded_run import RATING, RETURN
 from daedalus.analysis.run_groups import Group
 from daedalus.analysis.run_results import written
 from daedalus.analysis.statistics import performance_profile, profile_interval
+from daedalus.learner.reporting.metrics_rows import WIN_RATE
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.regular_files import replacing
 from daedalus.protocol.texts import one_line
@@ -38,24 +39,30 @@ _PLOTTED = {
     "policy_lag_mean": "policy lag (updates)",
 }
 COLUMNS = (*_PLOTTED, STD)  # that `draw_curves` needs
+_MOST_RATED = 4  # charts of the rating and of win rates
 _THRESHOLDS = 200
 
 
 def draw_curves(groups: Sequence[Group], output: Path, by: str) -> None:
-    """Draw return, entropy, value loss and policy lag of groups, one curve each. Raises OSError, ModuleNotFoundError.
+    """Draw return, entropy, value loss and policy lag of groups, one curve each; in games with opponents also ratings.
+
+    Raises OSError, ModuleNotFoundError.
 
     Args:
       groups: a group of one run is drawn with the standard deviation of its episodes, and with its evaluations.
       output: .png, .svg or .pdf.
       by: "env_steps" or "minutes".
     """
-    figure = _figure(11, 7)
-    axes = figure.subplots(2, 2, sharex=True)
+    rated = [name for name in _league_columns(groups) if any(series_of(group, name, by) for group in groups)]
+    plotted = _PLOTTED | {name: f"{title_of(name)}, newest policy" for name in rated[:_MOST_RATED]}
+    lines = math.ceil(len(plotted) / 2)
+    figure = _figure(11, 3.5 * lines)
+    axes = figure.subplots(lines, 2, sharex=True)
     several = any(len(group.runs) > 1 for group in groups)
     band = "band: 95 % interval of the runs" if several else "band: one std; circles: evaluations"
     if len(training_tasks(groups)) > 1:
         band += "; different tasks in training"
-    for axis, (column, title) in zip(axes.flat, _PLOTTED.items(), strict=True):
+    for axis, (column, title) in zip(axes.flat, plotted.items(), strict=False):
         for index, group in enumerate(groups):
             series = series_of(group, column, by)
             if series is None:
@@ -65,10 +72,19 @@ def draw_curves(groups: Sequence[Group], output: Path, by: str) -> None:
         axis.set_title(title.format(band), fontsize=10)
         axis.ticklabel_format(useOffset=False)  # an offset in a corner would hide what the ticks are
         axis.grid(alpha=0.3)
-    for axis in axes[1]:
+    for axis in axes.flat[len(plotted) - 2 : len(plotted)]:  # the lowest of each column
         axis.set_xlabel(by)
+        axis.tick_params(labelbottom=True)
+    for axis in axes.flat[len(plotted) :]:
+        axis.set_visible(False)
     axes[0, 0].legend(fontsize=8, loc="lower right")
     _save(figure, output)
+
+
+def _league_columns(groups: Sequence[Group]) -> list[str]:
+    """Return the columns of the rating and of the win rates that the runs have, the rating first."""
+    columns = {name for group in groups for run in group.runs for name in run.metrics}
+    return [RATING, *sorted(name for name in columns if name.startswith(WIN_RATE))]
 
 
 def draw_profiles(groups: Sequence[Group], output: Path) -> None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from daedalus.analysis.recorded_run import RATING
 from daedalus.analysis.run_groups import Group, environment_of
 from daedalus.analysis.statistics import (
     Strata,
@@ -53,6 +54,7 @@ class Comparison:
     threshold: float | None
     results: Sequence[GroupResult]
     other_task: bool = False  # whether a run trains on another task than that of evaluations
+    rated: bool = False  # whether a run is a game with opponents
     incomparable: str = ""  # why the final returns are not compared
     unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in their names
 
@@ -99,6 +101,7 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
         results=results,
         unnamed=groups[0].unnamed,
         other_task=other_task,
+        rated=any(not np.isnan(run.metrics.get(RATING, np.nan)).all() for run in runs),
         incomparable=problem,
     )
 
@@ -209,6 +212,11 @@ def notes(comparison: Comparison) -> list[str]:
         lines.append(
             "P(> first): probability that a run has a higher final return than one of the first group; "
             "0.5 if they are equal"
+        )
+    if comparison.rated:
+        lines.append(
+            "games with opponents: what one side wins, the other loses, so that returns of self-play say nothing about "
+            "the strength of play; let the policies play: daedalus evaluate RUN --against RUN2"
         )
     if comparison.incomparable:
         lines.append(comparison.incomparable)

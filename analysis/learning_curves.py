@@ -5,11 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.analysis.recorded_run import ENV_STEPS, RETURN, SECONDS, RecordedRun
+from daedalus.analysis.recorded_run import ENV_STEPS, RATING, RETURN, SECONDS, RecordedRun
 from daedalus.analysis.run_groups import Group
 from daedalus.analysis.statistics import interquartile_interval, interquartile_mean
+from daedalus.learner.reporting.metrics_rows import WIN_RATE
 
-STD = "episode_return_std"
+STD, DEVIATION = "episode_return_std", "rating_deviation"
+_BANDS = {RETURN: STD, RATING: DEVIATION}  # column that has half of the width, for the line of one run
 LARGEST = 1e100  # larger numbers are left out: their distances overflow
 _POINTS = 200
 
@@ -26,11 +28,17 @@ class Series:
     marks: tuple[np.ndarray, np.ndarray] | None = None  # single points, such as evaluations: where they lie, values
 
 
+def title_of(column: str) -> str:
+    """Return what a column of the metrics shows, for a person."""
+    opponent = column.removeprefix(WIN_RATE)
+    return column if opponent == column else f"win rate against {opponent}"
+
+
 def series_of(group: Group, column: str, by: str) -> Series | None:
     """Return the line of a group, or None if a run of it has no values.
 
     The line of several runs is their interquartile mean with its 95 % interval; the return of one run has the standard
-    deviation of its episodes and its evaluations.
+    deviation of its episodes and its evaluations, and the rating its deviation.
 
     Args:
       group: the runs.
@@ -96,11 +104,12 @@ def _group_series(name: str, runs: Sequence[RecordedRun], column: str, by: str) 
 
 def _run_series(name: str, run: RecordedRun, column: str, by: str) -> Series:
     x, y = points(run, column, by)
-    if column != RETURN or STD not in run.metrics:
+    band = _BANDS.get(column)
+    if band is None or band not in run.metrics:
         return Series(name=name, x=x, y=y)
-    std_x, std = points(run, STD, by)
+    std_x, std = points(run, band, by)
     spread = np.interp(x, std_x, std) if len(std) else np.zeros(len(x))
-    at, values = evaluations(run, by)
+    at, values = evaluations(run, by) if column == RETURN else (np.zeros(0), np.zeros(0))
     known = (np.abs(values) < LARGEST) & (np.abs(at) < LARGEST)
     marks = (at[known], values[known]) if known.any() else None
     return Series(name=name, x=x, y=y, low=y - spread, high=y + spread, marks=marks)

@@ -9,7 +9,8 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-from daedalus.analysis.recorded_run import ENVIRONMENT, RecordedEvaluation, RunRecord
+from daedalus.analysis.learning_curves import DEVIATION
+from daedalus.analysis.recorded_run import ENVIRONMENT, RATING, RecordedEvaluation, RunRecord
 from daedalus.analysis.run_results import episode_statistics, failure_counts, statistics_rows, written
 from daedalus.learner.run.settings import setting_text
 from daedalus.policy.saving.hub import LIBRARY
@@ -135,7 +136,15 @@ def _use(spec: RunSpec, repository: str) -> str:
 
 def _training(record: RunRecord, spec: RunSpec) -> str:
     seconds = record.number("wall_seconds")
+    rating = record.number(RATING)
+    rates = record.league.win_rates if record.league else {}
     rows = [
+        *(
+            []
+            if rating is None
+            else [("rating in its league", f"{rating:,.0f} ± {record.number(DEVIATION) or 0.0:,.0f}")]
+        ),
+        *((f"win rate against {name}", f"{rate:.0%}") for name, rate in rates.items()),
         ("env_steps", written(record.number("env_steps"))),
         ("updates", written(record.number("updates"))),
         ("minutes", "-" if seconds is None else f"{seconds / 60.0:.1f}"),

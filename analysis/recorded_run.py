@@ -27,11 +27,13 @@ from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.policy.user_modules import allow_settings
+from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.texts import bounded_text
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
+RATING = "rating"  # of the newest policy, in games with opponents
 EVALUATION_RETURN = "evaluation_return_mean"  # during training
 
 # Numbers that are computed with. Files of other releases, or that somebody changed, may have other values.
@@ -379,6 +381,14 @@ class RunRecord(RecordedRun):
         """What the run waited for, in one line; empty if it is not known."""
         text = self.summary.get("bottleneck")
         return bounded_text(text) if isinstance(text, str) else ""
+
+    @property
+    def league(self) -> LeagueStatus | None:
+        """Ratings and results of a game with opponents at the end of training; None without any that can be read."""
+        try:
+            return LeagueStatus.model_validate(self.summary.get("league")).bounded()
+        except ValidationError:
+            return None
 
     @property
     def rejected(self) -> dict[str, int]:

@@ -16,8 +16,8 @@ import numpy as np
 
 from daedalus.analysis.charts import LARGE, SERIES_COLOURS, SMALL, histogram, line_chart
 from daedalus.analysis.comparison import Comparison, cells, compare_groups, header, notes
-from daedalus.analysis.learning_curves import LARGEST, Series, series_of
-from daedalus.analysis.recorded_run import ENVIRONMENT, RETURN, RunRecord, finite
+from daedalus.analysis.learning_curves import DEVIATION, LARGEST, Series, series_of, title_of
+from daedalus.analysis.recorded_run import ENVIRONMENT, RATING, RETURN, RunRecord, finite
 from daedalus.analysis.run_groups import Group, environment_of
 from daedalus.analysis.run_results import (
     EpisodeStatistics,
@@ -29,10 +29,11 @@ from daedalus.analysis.run_results import (
     together,
     written,
 )
-from daedalus.learner.reporting.metrics_rows import ENV, USER
+from daedalus.learner.reporting.metrics_rows import ENV, USER, WIN_RATE
 from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.settings import changed_settings, setting_text, value_text
 from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
+from daedalus.protocol.league import NEWEST, LeagueStatus, Score
 from daedalus.protocol.texts import printable
 
 _STYLE = Path(__file__).with_name("report_style.css")
@@ -58,7 +59,8 @@ _TITLES = {
     "rollouts_rejected": "rejected rollouts",
     "updates_skipped": "skipped updates",
 }
-_MOST_OWN = 24  # columns of the environment and of the user
+_MOST_OWN = 24  # columns of the environment, of the user and of opponents
+_STRONGEST = 45  # percent of the colour in a cell of a matrix, so that its text can be read
 
 Child = str | int | float | None | ET.Element | Iterable["Child"]
 
@@ -85,6 +87,7 @@ def run_page(group: Group[RunRecord], by: str) -> str:
         element("p", unfinished, class_="note") if unfinished else None,
         summary_tiles(record),
         element("p", record.bottleneck, class_="muted") if record.bottleneck else None,
+        league_section(group, by),
         return_section([group], by),
         video_section(record),
         evaluation_section(record),
@@ -175,6 +178,9 @@ def summary_tiles(record: RunRecord) -> ET.Element:
             value, low, high = statistics.interquartile
             interval = "" if math.isnan(low) else f"95 % interval {interval_text(low, high)}"
             values.append(("interquartile mean", written(value), interval))
+    rating, deviation = record.number(RATING), record.number(DEVIATION)
+    if rating is not None:
+        values.append(("rating", f"{rating:,.0f} ± {deviation or 0.0:,.0f}", "of the newest policy in its league"))
     trained = record.number("episode_return_mean")
     values.append(("training", written(trained), "mean return of the newest episodes"))
     budget = record.settings.get("training.env_steps")
@@ -455,20 +461,88 @@ def return_section(groups: Sequence[Group], by: str, of: str = "") -> ET.Element
         band = "A line of several runs is their interquartile mean, its band the 95 % bootstrap interval."
         if any(len(group.runs) == 1 for group in groups):
             band += " A line of one run has one standard deviation of the newest episodes, and circles for evaluations."
-    lines, colours = _lines(groups, RETURN, by)
-    # Two sizes, so that texts have the same size on a wide and on a narrow page: each shows one of them.
-    sizes = (("on-wide", LARGE), ("on-narrow", SMALL))
-    drawn = [
-        element("div", line_chart(_named(_TITLES[RETURN], of), lines, unit=by, colours=colours, size=size), class_=name)
-        for name, size in sizes
-        if lines
-    ]
-    nothing = None if lines else element("p", "No episode has ended: there is no return.", class_="note")
+    chart = _large_chart(groups, RETURN, _TITLES[RETURN], by, of)
     return section(
         "Return",
         _legend([_key_of(group, index) for index, group in enumerate(groups)]) if several else None,
-        nothing or element("figure", element("figcaption", _TITLES[RETURN]), drawn, class_="chart"),
+        element("p", "No episode has ended: there is no return.", class_="note") if chart is None else chart,
         element("p", band, class_="muted"),
+    )
+
+
+def _large_chart(groups: Sequence[Group], column: str, title: str, by: str, of: str = "") -> ET.Element | None:
+    """Return the chart of a column as wide as the page, or None if it has no values."""
+    lines, colours = _lines(groups, column, by)
+    # Two sizes, so that texts have the same size on a wide and on a narrow page: each shows one of them.
+    sizes = (("on-wide", LARGE), ("on-narrow", SMALL))
+    drawn = [
+        element("div", line_chart(_named(title, of), lines, unit=by, colours=colours, size=size), class_=name)
+        for name, size in sizes
+        if lines
+    ]
+    return element("figure", element("figcaption", title), drawn, class_="chart") if drawn else None
+
+
+def league_section(group: Group[RunRecord], by: str) -> ET.Element | None:
+    """Return the rating of a run over its training, its players and who beats whom; None without opponents."""
+    (record,) = group.runs
+    chart, league = _large_chart([group], RATING, "rating of the newest policy", by), record.league
+    if chart is None and league is None:
+        return None
+    explained = (
+        "A player with 200 points more wins 76 of 100 matches. Its skill is within ± of its rating in two of three "
+        "cases; the band is this deviation."
+    )
+    if league is None:
+        players = element("p", "The learner records the results between the players at its end.", class_="note")
+        return section("League", chart, element("p", explained, class_="muted"), players)
+    scores = league.scores_of(NEWEST)
+    rows = [
+        (
+            each.player,
+            each.text.replace("+-", "±"),
+            f"{each.matches:,}",
+            f"{scores[each.player].win_rate:.0%}" if each.player in scores else "-",
+        )
+        for each in sorted(league.players, key=lambda each: -each.rating)
+    ]
+    more = f"{league.left_out:,} more players are not shown." if league.left_out else ""
+    return section(
+        "League",
+        chart,
+        element("p", explained, class_="muted"),
+        table(("player", "rating", "matches", "newest wins"), rows, label="players by rating", numeric={1, 2, 3}),
+        element("p", more, class_="muted") if more else None,
+        _win_rates(league),
+    )
+
+
+def _win_rates(league: LeagueStatus) -> ET.Element:
+    """Return the matrix of win rates, coloured, with the results in the tooltip of each cell."""
+    names = [each.player for each in league.players]
+    rows = []
+    for first in names:
+        scores = league.scores_of(first)
+        cells = [_win_rate(scores.get(second)) if second != first else "" for second in names]
+        rows.append((first, *cells))
+    title = "win rates in percent: of the player of a row against that of a column; a draw is half a win"
+    head = ("wins of, against", *(element("span", name) for name in names))
+    matrix = table(head, rows, label=title, numeric=range(1, len(names) + 1))
+    matrix.set("class", "scroll matrix")
+    return element("figure", element("figcaption", title), matrix, class_="chart")
+
+
+def _win_rate(score: Score | None) -> Child:
+    if score is None:
+        return element("span", "-")
+    rate = score.win_rate
+    results = f"{score.wins:.4g} won, {score.draws:.4g} drawn, {score.losses:.4g} lost"
+    return element(
+        "span",
+        f"{100 * rate:.0f}",
+        class_="wins" if rate >= 0.5 else "loses",
+        style=f"--share: {_STRONGEST * abs(2 * rate - 1):.0f}%",
+        title=f"{score.first} against {score.second}: {rate:.0%} of {score.matches:.4g} matches ({results})",
     )
 
 
@@ -482,9 +556,9 @@ def _curves(groups: Sequence[Group], by: str, of: str = "") -> ET.Element | None
     `of` tells charts of the page apart.
     """
     columns = {name for group in groups for run in group.runs for name in run.metrics}
-    own = sorted(name for name in columns if name.startswith((ENV, USER)))[:_MOST_OWN]
+    own = sorted(name for name in columns if name.startswith((ENV, USER, WIN_RATE)))[:_MOST_OWN]
     charts = []
-    for column, title in {**_TITLES, **{name: name for name in own}}.items():
+    for column, title in {**_TITLES, **{name: title_of(name) for name in own}}.items():
         lines, colours = _lines(groups, column, by)
         if column != RETURN and any(series.y.any() for series in lines):  # all 0: nothing of the kind happened
             charts.append(_figure(title, line_chart(_named(title, of), lines, unit=by, colours=colours)))

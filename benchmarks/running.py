@@ -19,15 +19,17 @@ _WARM_SECONDS = 10.0
 def train(*arguments: object) -> dict[str, Any]:
     """Run `daedalus train ARGUMENTS` in a temporary folder; return its summary with `exit_status`."""
     with tempfile.TemporaryDirectory() as folder:
-        directory = Path(folder) / "run"
-        words = [str(argument) for argument in arguments]
-        finished = subprocess.run(
-            [*COMMAND, "train", *words, "--run-dir", str(directory)], capture_output=True, text=True, check=False
-        )
-        if finished.returncode not in (0, 3):
-            raise SystemExit(f"daedalus train {' '.join(words)} failed:\n{finished.stdout}{finished.stderr}")
-        summary = json.loads((directory / "summary.json").read_text())
-    return {**summary, "exit_status": finished.returncode}
+        return train_in(Path(folder) / "run", *arguments)
+
+
+def train_in(directory: Path, *arguments: object) -> dict[str, Any]:
+    """Run `daedalus train ARGUMENTS` in a run directory, which stays. See `train`."""
+    words = [str(argument) for argument in arguments]
+    command = [*COMMAND, "train", *words, "--run-dir", str(directory)]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    if finished.returncode not in (0, 3):
+        raise SystemExit(f"daedalus train {' '.join(words)} failed:\n{finished.stdout}{finished.stderr}")
+    return {**json.loads((directory / "summary.json").read_text()), "exit_status": finished.returncode}
 
 
 def learning_rate(*arguments: object) -> float:

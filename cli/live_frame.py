@@ -13,7 +13,7 @@ from rich.text import Text
 
 from daedalus.cli.run_watcher import WatchedRun
 from daedalus.learner.reporting.progress import duration
-from daedalus.protocol.messages import ActorStatus
+from daedalus.protocol.messages import ActorStatus, RunStatus
 from daedalus.protocol.texts import one_line, policy_lag, short_number, short_rate
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
@@ -69,6 +69,8 @@ def _run(run: WatchedRun, width: int, lines: int, ascii_only: bool) -> list[Rend
     status = run.status
     notes = [_line([f"PROBLEM: {problem}"], width, "yellow") for problem in status.problems[:_SHOWN_PROBLEMS]]
     notes += [_line([status.bottleneck], width)] if status.bottleneck else []
+    rates = [f"{name} {rate:.0%}" for name, rate in status.league.win_rates.items()] if status.league else []
+    notes += [_line(["newest wins against", *rates], width)] if rates else []
     lines = max(lines - len(notes), 0)
     shown = status.actors[:lines]
     more = status.fleet_size - len(shown)
@@ -85,9 +87,8 @@ def _head(run: WatchedRun, width: int, ascii_only: bool) -> list[RenderableType]
     share = min(status.env_steps / max(status.env_steps_budget, 1), 1.0)
     up = f"  up {duration(status.uptime_seconds)}" if width >= _WIDE else ""
     left = "-" if run.seconds_left is None else duration(run.seconds_left)
-    mean = "-" if status.episode_return_mean is None else short_number(status.episode_return_mean)
-    label = f"return {mean:>8}  "
-    curve = sparkline(run.returns, min(width - len(label) - 1, _SPARKLINE_WIDTH), ASCII if ascii_only else BLOCKS)
+    label = f"{_strength(status)}  "
+    curve = sparkline(run.curve, min(width - len(label) - 1, _SPARKLINE_WIDTH), ASCII if ascii_only else BLOCKS)
     progress = Table.grid(padding=(0, 1))
     progress.add_row(
         ProgressBar(total=1.0, completed=share, width=max(min(width - (40 if up else 24), 40), 5)),
@@ -116,6 +117,13 @@ def _head(run: WatchedRun, width: int, ascii_only: bool) -> list[RenderableType]
             width,
         ),
     ]
+
+
+def _strength(status: RunStatus) -> str:
+    """Return the rating of the newest policy with its deviation, or the mean return where there is no rating."""
+    if status.league and (newest := status.league.newest):
+        return f"rating {newest.text:>14}"
+    return f"return {'-' if status.episode_return_mean is None else short_number(status.episode_return_mean):>8}"
 
 
 def _actors(actors: Sequence[ActorStatus], width: int, updates_per_batch: int) -> Table:

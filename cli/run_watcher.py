@@ -12,16 +12,17 @@ from daedalus.protocol.messages import MetricsReport, RunStatus
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.status_query import survey
 
-_RETURN = "episode_return_mean"
-_MAX_RETURNS = 4096  # then every second one is dropped
+_CURVES = ("rating", "episode_return_mean")  # of a run, the first that it has
+_MAX_POINTS = 4096  # then every second one is dropped
 
 
 class WatchedRun:
-    """Newest status of a learner, and the returns of its whole run."""
+    """Newest status of a learner, and the curve of its whole run: of ratings or returns."""
 
     def __init__(self, status: RunStatus) -> None:
         self.status = status
-        self.returns: list[float] = []  # mean of the newest episodes, from the begin of the run on
+        self.curve: list[float] = []  # from the begin of the run on
+        self._column = ""  # whose values it has
         self.next_row = 0  # of the metrics, not seen yet
 
     @property
@@ -40,11 +41,14 @@ class WatchedRun:
         if not len(report.numbers):
             return
         self.next_row = int(report.numbers[-1]) + 1
-        if _RETURN in report.page.columns:
-            values = report.values[:, report.page.columns.index(_RETURN)].tolist()
-            self.returns += [value for value in values if math.isfinite(value)]
-        while len(self.returns) > _MAX_RETURNS:
-            del self.returns[::2]
+        column = next((name for name in _CURVES if name in report.page.columns), "")
+        if column:
+            self.curve = self.curve if column == self._column else []
+            self._column = column
+            values = report.values[:, report.page.columns.index(column)].tolist()
+            self.curve += [value for value in values if math.isfinite(value)]
+        while len(self.curve) > _MAX_POINTS:
+            del self.curve[::2]
 
 
 MAX_ACTORS = 50  # of each run that are queried; a terminal has no lines for more

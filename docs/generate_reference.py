@@ -27,7 +27,8 @@ PYTHON_API = {
         "RunDataError",
     ),
     "Use a trained policy": (
-        *("evaluate", "EvaluationResult", "load_policy", "Policy", "Decisions", "NoPolicyError", "DamagedError"),
+        *("evaluate", "EvaluationResult", "MatchScores", "MatchScore"),
+        *("load_policy", "Policy", "Decisions", "NoPolicyError", "DamagedError"),
         *("EnvironmentSetupError", "HubError", "VideoError"),
     ),
     "Client": ("Client", "daedalus.actor.collecting.client_agent.ClientAgent"),

@@ -353,7 +353,8 @@ def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None
             "not known: if it has images or continuous actions, name the settings with --set or in a TOML file",
             spec.environment.id,
         )
-    return report.spaces, default_settings(report.spaces, [*spec.environment.leave_out, *report.constant_texts])
+    leave_out = [*spec.environment.leave_out, *report.constant_texts]
+    return report.spaces, default_settings(report.spaces, leave_out, report.seats)
 
 
 def quick_check(

@@ -1,20 +1,25 @@
 """The process of the evaluation after training: it selects the best checkpoint, and lets evaluators play with it."""
 
 import argparse
+import io
 import logging
 import math
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episodes import EvaluationStoppedError
-from daedalus.launch.evaluation_options import evaluated_environment
+from daedalus.launch.evaluation_options import EvaluationOptions, evaluated_environment
 from daedalus.launch.logs import configure_logging, print_error
+from daedalus.launch.match_evaluation import MatchScores, evaluated_matches
 from daedalus.launch.process_lifecycle import (
     FAILED,
     UNSAVED,
@@ -26,10 +31,12 @@ from daedalus.launch.process_lifecycle import (
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
-from daedalus.policy.acting.runtime import program_hash
+from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.policy.saving.best_checkpoints import best_score, is_best, is_best_in_training, rescore
+from daedalus.policy.saving.hub import HubError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, read_candidates
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_modules import ModuleNotAllowedError
 from daedalus.protocol.messages import EvaluationReport, Program
 from daedalus.protocol.spec import Backend, RunSpec
 from daedalus.protocol.texts import short_number
@@ -40,6 +47,10 @@ _logger = logging.getLogger("daedalus.launch.final_evaluation")  # this module i
 
 # Added to the seed of the run, so that neither training nor another evaluation uses these seeds.
 _FINAL_SEEDS, _SELECTION_SEEDS = 2**32, 2**33
+_FAILURES = (
+    *(EnvironmentSetupError, EvaluatorError, NoPolicyError, DamagedError, HubError),
+    *(ModuleNotAllowedError, PolicyError, SettingsError, TransportError),
+)
 _ERRORS = 3.0  # standard errors between two means that differ
 _FEWEST = 10  # episodes, from which on their standard error means something
 
@@ -91,6 +102,16 @@ def evaluation_summary(evaluation: dict[str, Any], **more: Any) -> dict[str, Any
         "evaluation_return_std": evaluation["return_std"],
         "evaluation": {**without_episodes(evaluation), **more},
     }
+
+
+def match_note(scores: MatchScores) -> str:
+    """Return how the games against one opponent ended."""
+    total = scores.total
+    low, high = (f"{100.0 * bound:.0f}" for bound in total.win_interval)
+    return (
+        f"against {scores.opponent}: won {total.wins} of {total.games} games (95 % interval {low} to {high} %), drew "
+        f"{total.draws}, lost {total.losses}"
+    )
 
 
 class FinalEpisodes:
@@ -159,6 +180,30 @@ class FinalEpisodes:
             scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
         return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
 
+    def play_matches(self, opponents: Sequence[str], modules: frozenset[str]) -> None:
+        """Play the final games against opponents in this process, and write summary.json and evaluation.json.
+
+        The result is that of the first opponent; notes have those of the others. Raises as `evaluate`,
+        EnvironmentSetupError and HubError.
+        """
+        began, directory, spec = time.monotonic(), self._directory, self._spec
+        policy, sides = find_policy(directory), len(spec.league.sides) or 2
+        games = max(spec.evaluation.final_episodes // sides, 1) * sides
+        results = []
+        for name in opponents:
+            options = EvaluationOptions(directory=directory, against=name, episodes=games, allowed_modules=modules)
+            seed = spec.training.seed + _FINAL_SEEDS
+            results.append(evaluated_matches(policy, options, seed, self._stop, io.StringIO()))
+        evaluation = {**results[0], "matches": asdict(results[0]["matches"])}
+        evaluation["notes"] += [match_note(result["matches"]) for result in results[1:]]
+        summary = run_directory.read_json(directory / run_directory.SUMMARY)
+        seconds = time.monotonic() - began
+        summary |= evaluation_summary(
+            evaluation, select_best=[], seconds=seconds, summary=match_note(results[0]["matches"])
+        )
+        run_directory.write_json(directory / run_directory.EVALUATION, evaluation)
+        run_directory.write_json(directory / run_directory.SUMMARY, summary)
+
     def evaluate(self) -> None:
         """Select the best checkpoint, play the final episodes with it, and write summary.json and evaluation.json.
 
@@ -199,14 +244,20 @@ def main() -> int:
     options.add_argument("--log-level", default="info")
     options.add_argument("--log-json", action="store_true")
     options.add_argument("--exit-with-parent", action="store_true")
+    options.add_argument("--against", action="append", default=[])
+    options.add_argument("--allow-module", action="append", default=[])
     parsed = options.parse_args()
     configure_logging(parsed.log_level, as_json=parsed.log_json)
     stop = stop_on_signals(exit_if_stuck=True)
     exit_with_parent(stop)
     try:
         with closing(listen([parsed.address])) as transport:
-            FinalEpisodes(parsed.directory, run_directory.read_config(parsed.directory), transport, stop).evaluate()
-    except (EvaluatorError, NoPolicyError, DamagedError, SettingsError, TransportError) as error:
+            final = FinalEpisodes(parsed.directory, run_directory.read_config(parsed.directory), transport, stop)
+            if parsed.against:
+                final.play_matches(parsed.against, frozenset(parsed.allow_module))
+            else:
+                final.evaluate()
+    except _FAILURES as error:
         print_error("train", error)
         return FAILED
     except EvaluationStoppedError:

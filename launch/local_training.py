@@ -35,12 +35,14 @@ from daedalus.launch.supervision import (
     supervised_gateway,
 )
 from daedalus.launch.tracker_processes import TrackerProcesses
+from daedalus.learner.league.versions import VersionFolder
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.run_directory import OPERATOR_TOKEN
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import EventFile
 from daedalus.policy.saving.saved_policy import candidates
 from daedalus.policy.user_modules import allow_settings
+from daedalus.protocol.league import version_name
 from daedalus.protocol.texts import one_line
 from daedalus.transport.private_address import private_address
 
@@ -254,6 +256,17 @@ def _remedy(run: LocalRun) -> str:
     return f"make room on the disk, or make it writable, then type: {resume_command(run)}"
 
 
+def _final_opponents(run: LocalRun) -> list[str]:
+    """Return the opponents of the final evaluation of a policy that plays itself; empty for any other run.
+
+    They are the fixed ones, or else the oldest version that the league has kept.
+    """
+    if not run.spec.environment.is_game:
+        return []
+    kept = [each.policy_version for each in VersionFolder(run.directory / run_directory.LEAGUE).versions()]
+    return (list(run.spec.league.opponents) or [version_name(min(kept))]) if kept else []
+
+
 def evaluate_run(
     run: LocalRun, stopping: threading.Event, output: ChildOutput, open_streams: OpenStreams = inherited
 ) -> dict[str, Any]:
@@ -271,11 +284,15 @@ def evaluate_run(
     """
     if not (run.directory / run_directory.SUMMARY).exists():  # the learner has said why
         raise UnsavedError(f"the summary of the run could not be saved: {_remedy(run)}")
-    names = [f"evaluation-{number}" for number in range(min(len(candidates(run.directory)) or 1, os.cpu_count() or 1))]
+    most = min(len(candidates(run.directory)) or 1, os.cpu_count() or 1)
+    opponents = _final_opponents(run)
+    names = [] if opponents else [f"evaluation-{number}" for number in range(most)]
     options = *helper_log_words(run.logs), *allow_settings(run.spec.environment.user_modules)
     with private_address() as address:
         with open_streams("evaluation") as streams:
-            arguments = (str(run.directory), address, *run.logs.words())
+            # It plays games against opponents itself.
+            games = [*allow_settings(run.spec.actor_modules), *(f"--against={name}" for name in opponents)]
+            arguments = (str(run.directory), address, *run.logs.words(), *(games if opponents else ()))
             host = start("daedalus.launch.final_evaluation", *arguments, streams=streams, descriptors=run.lock)
         try:
             with evaluators(address, names, options, output, run.start_player) as failure:

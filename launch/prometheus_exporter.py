@@ -139,6 +139,12 @@ _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], 
     ),
     (
         GaugeMetricFamily,
+        "rating",
+        "Rating of the newest policy in a game with opponents.",
+        lambda run: run.league.newest.rating if run.league and run.league.newest else None,
+    ),
+    (
+        GaugeMetricFamily,
         "learning_share",
         "Recent share of the time in which the learner computed updates.",
         lambda run: run.learning_share,
@@ -253,14 +259,19 @@ def metrics(statuses: Iterable[RunStatus], unread: Iterable[str] = ()) -> Iterat
     learners = GaugeMetricFamily("daedalus_learners", "Learners of the run that answer.", labels=["run"])
     actors = GaugeMetricFamily("daedalus_actors", "Actors by state.", labels=["run", "state"])
     rejected = CounterMetricFamily("daedalus_rollouts_rejected", "Rejected rollouts by cause.", labels=["run", "cause"])
+    wins = GaugeMetricFamily(
+        "daedalus_win_rate", "Win rate of the newest policy against a fixed opponent.", labels=["run", "opponent"]
+    )
     for run in runs:
+        for opponent, rate in (run.league.win_rates if run.league else {}).items():
+            wins.add_metric([run.run, opponent], rate)
         info.add_metric([run.run, run.environment, run.algorithm], 1)
         learners.add_metric([run.run], sum(status.run == run.run for status in statuses))
         for state, count in _states(run).items():
             actors.add_metric([run.run, state], count)
         for cause, count in sorted(run.rollouts_rejected.items()):
             rejected.add_metric([run.run, cause], count)
-    yield from (info, learners, actors, rejected)
+    yield from (info, learners, actors, rejected, wins)
     for kind, name, text, value_of in _OF_A_RUN:
         family = kind(f"daedalus_{name}", text, labels=["run"])
         for run in runs:

@@ -4,6 +4,9 @@ A match is one episode of a game between two players. The first has the agents o
 A player is the newest policy, one of its kept versions, or a fixed opponent under its name in the settings.
 """
 
+import math
+import re
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -26,6 +29,12 @@ Purpose = Literal["training", "rating"]
 def version_name(policy_version: int) -> str:
     """Return the name of the player that is a kept version of the policy."""
     return f"v{policy_version}"
+
+
+def version_of(player: str) -> int | None:
+    """Return the policy version that a player is, or None if it is none."""
+    match = re.fullmatch(r"v(0|[1-9]\d{0,18})", player, re.ASCII)
+    return None if match is None else int(match[1])
 
 
 def is_bot(player: str) -> bool:
@@ -76,12 +85,20 @@ class Plan(Specification):
 
 
 class RatedPlayer(Specification):
-    """Rating of a player, in points of its scale: the skill is within `deviation` of `rating` in two of three cases."""
+    """Rating of a player on the scale of Elo: a player with 200 points more wins 76 of 100 matches.
+
+    The skill is within `deviation` of `rating` in two of three cases.
+    """
 
     player: PlayerName
     rating: float
     deviation: float
     matches: NaturalInt = 0
+
+    @property
+    def text(self) -> str:
+        """Rating and deviation for a person, such as `1,250 +- 50`."""
+        return f"{round(self.rating):,} +- {round(self.deviation):,}"
 
 
 class Score(Specification):
@@ -93,9 +110,79 @@ class Score(Specification):
     draws: float = 0.0
     losses: float = 0.0
 
+    @property
+    def matches(self) -> float:
+        """Number of matches."""
+        return self.wins + self.draws + self.losses
+
+    @property
+    def win_rate(self) -> float:
+        """Share of the matches that the first player has won; a draw is half a win. NaN without matches."""
+        return (self.wins + self.draws / 2) / self.matches if self.matches else math.nan
+
+
+STATUS_PLAYERS = 24  # at most in a status: a matrix that a person can read
+_STATUS_BYTES = 48 << 10  # of their scores in a message, about; a status with all its actors has room for more
+_SCORE_BYTES = 64  # without the names
+
 
 class LeagueStatus(Specification):
     """Ratings and results for people: status, page, report."""
 
-    players: tuple[RatedPlayer, ...] = ()  # the newest policy first, then versions from old to new, then the others
-    scores: tuple[Score, ...] = ()  # of pairs that have played, each once
+    # The newest policy first, then versions from old to new, then the others. See `bounded`.
+    players: tuple[RatedPlayer, ...] = ()
+    scores: tuple[Score, ...] = ()  # of pairs of `players` that have played, each once
+    left_out: NaturalInt = 0  # number of players that are not in `players`
+
+    @property
+    def newest(self) -> RatedPlayer | None:
+        """The newest policy; None before the first rating."""
+        return next((each for each in self.players if each.player == NEWEST), None)
+
+    @property
+    def fixed_opponents(self) -> list[str]:
+        """Names of the opponents that are neither the newest policy nor versions of it."""
+        return [each.player for each in self.players if each.player != NEWEST and version_of(each.player) is None]
+
+    @property
+    def win_rates(self) -> dict[str, float]:
+        """Win rate of the newest policy against each fixed opponent that it has played. See Score.win_rate."""
+        scores = self.scores_of(NEWEST)
+        return {name: scores[name].win_rate for name in self.fixed_opponents if name in scores}
+
+    def scores_of(self, player: str) -> Mapping[str, Score]:
+        """Return the results of a player against each other one that it has played, by the other's name."""
+        found: dict[str, Score] = {}
+        for score in self.scores:
+            if score.matches and player == score.first:
+                found[score.second] = score
+            elif score.matches and player == score.second:
+                turned = {"first": score.second, "second": score.first, "wins": score.losses, "losses": score.wins}
+                found[score.first] = score.model_copy(update=turned)
+        return found
+
+    def bounded(self, most: int = STATUS_PLAYERS) -> "LeagueStatus":
+        """Return the league with at most `most` players, fewer if their names are long, and the scores between them.
+
+        The newest policy stays; of the others at most half are fixed opponents, those with the most matches, and the
+        rest are versions from the oldest to the newest in equal distances.
+        """
+        versions = [each.player for each in self.players if version_of(each.player) is not None]
+        matches = {each.player: each.matches for each in self.players}
+        others = sorted(self.fixed_opponents, key=lambda name: -matches[name])
+        others = others[: max((most - 1) // 2, most - 1 - len(versions))]
+        kept = {NEWEST, *others, *_spread(versions, most - 1 - len(others))}
+        scores = tuple(each for each in self.scores if each.first in kept and each.second in kept)
+        size = sum(len(f"{each.first}{each.second}".encode()) + _SCORE_BYTES for each in scores)
+        if size > _STATUS_BYTES:
+            return self.bounded(most // 2)
+        players = tuple(each for each in self.players if each.player in kept)
+        left_out = self.left_out + len(self.players) - len(players)
+        return LeagueStatus(players=players, scores=scores, left_out=left_out)
+
+
+def _spread(names: list[str], most: int) -> list[str]:
+    """Return at most `most` names, the first and the last and others in equal distances between them."""
+    if len(names) <= most:
+        return names
+    return [names[round(place * (len(names) - 1) / max(most - 1, 1))] for place in range(most)]

@@ -269,7 +269,7 @@ class RunStatus(Specification):
     learning_share: float = 0.0  # of the time in which the learner computes updates
     decoding_share: float = 0.0  # of the time in which the learner decodes rollouts
     last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
-    league: LeagueStatus | None = None  # of a game with opponents
+    league: LeagueStatus | None = None  # of a game with opponents, bounded (LeagueStatus.bounded)
 
     @property
     def fleet_size(self) -> int:

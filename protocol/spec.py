@@ -318,7 +318,7 @@ class TrainingSpec(LossSpec):
     target_episodes: PositiveInt = 100
     """Number of newest training episodes in the mean return."""
     stop_when_solved: bool = True
-    """Stop when `target_return` is reached. Otherwise use the whole budget."""
+    """Stop when the target is reached: `target_return`, or that of `[league]`. Otherwise use the whole budget."""
 
     batch_rollouts: PositiveInt | None = None
     """Rollouts in a batch. Unset: `collection.actors` for `impala` and `appo`, 1 for the others. Not for `a2c`."""

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,19 +15,26 @@ from processes import Running, free_address, starting
 # processes of the tests. A learner sets its own number of threads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# Keep bytecode, also where the environment asks for none, as container images do: the tests start hundreds of
+# processes, and each would spend a sixth of its time on compiling the same modules.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
 settings.register_profile("daedalus", deadline=None)
 settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
 settings.load_profile("daedalus")
 
+# Names in a module of tests that starts processes.
+STARTING = {"subprocess", "Running", "starting", "processes_mentioning", "installed", "nbclient"}
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with the files whose tests wait for processes, so that at the end no worker waits alone.
+    """Begin with the files whose tests start processes, which take longest, so that at the end no worker works alone.
 
     In `make mutants`, where the first failure ends the tests of a mutant, begin with the fastest tests.
     """
-    waiting = {item.path for item in items if "start" in getattr(item, "fixturenames", ())}
-    items.sort(key=lambda item: item.path not in waiting)
+    items.sort(key=lambda item: not (isinstance(item, pytest.Function) and STARTING & vars(item.module).keys()))
     measured = config.rootpath / "mutmut-stats.json"
     if measured.exists():
         seconds = json.loads(measured.read_text("utf-8"))["duration_by_test"]

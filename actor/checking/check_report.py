@@ -17,6 +17,7 @@ class EnvironmentReport(Specification):
 
     spaces: Spaces | None = None  # as a run has them; None if the environment cannot be made or is not supported
     constant_texts: dict[str, str] = Field(default_factory=dict)  # components left out, and their content
+    seats: int = 1  # agents of a game that the policy plays
     problems: tuple[str, ...] = ()  # training would fail
     warnings: tuple[str, ...] = ()  # training would run, perhaps not as intended
     notes: tuple[str, ...] = ()  # advice of gymnasium's own checker

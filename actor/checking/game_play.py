@@ -36,7 +36,7 @@ def check_game(
         return EnvironmentReport(problems=(str(error),))
     try:
         environments = TransformedEnvironment(games, spec)
-        report = EnvironmentReport(spaces=environments.spaces)
+        report = EnvironmentReport(spaces=environments.spaces, seats=environments.seats)
         if seconds == 0.0:
             return report
         return report.model_copy(update=_played(environments, games, spec, seconds, env_steps, seed))

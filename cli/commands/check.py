@@ -26,7 +26,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.texts import exact_number, short_number
+from daedalus.protocol.texts import short_number
 
 _DESCRIPTION = """\
 Makes one environment and plays it with random actions: whether reset and step keep to gymnasium's interface, whether
@@ -94,7 +94,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
     chosen = report = _report(check)
     processes = ""
     if choice.env is not None:
-        defaults = default_settings(report.spaces, [*environment.leave_out, *report.constant_texts])
+        defaults = default_settings(report.spaces, [*environment.leave_out, *report.constant_texts], report.seats)
         defaults, processes = with_measured_processes(choice.spec, defaults, report)
         spec = choice.spec(defaults)
         if spec.environment != environment and report.spaces is not None:
@@ -151,7 +151,7 @@ def _description(spec: RunSpec, report: EnvironmentReport) -> Iterator[tuple[str
 
 def _choices(spec: RunSpec, network: str) -> Iterator[tuple[str, str]]:
     collection, training = spec.collection, spec.training
-    target = "no target" if training.target_return is None else f"target return {exact_number(training.target_return)}"
+    target = f"target: {spec.target}" if spec.target else "no target"
     yield (
         "train",
         f"{training.algorithm}, {collection.actors} actors x {collection.envs_per_actor} environments, rollouts of "

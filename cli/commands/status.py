@@ -3,7 +3,7 @@
 import argparse
 import json
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
+from daedalus.protocol.league import NEWEST, LeagueStatus
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import one_line, policy_lag, printable, short_duration, short_number, short_rate
 from daedalus.transport.certificate_expiry import WARNING_DAYS
@@ -29,6 +30,7 @@ from daedalus.transport.status_query import ask_events, no_answer, survey, waiti
 
 HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
 _MOST_WAITING = 20  # names of actors that wait for a run
+_MOST_PLAYERS, _LONGEST_PLAYER = 12, 50  # of a game; characters of a name
 _FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0  # between two looks
 _WIDTH = 100  # characters of a line of the state
 _WRAPPER = TextWrapper(_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
@@ -49,7 +51,8 @@ examples:
 lag is how old the policy of an actor's newest rollout was: the actors play while the learner trains, so a few
 batches are normal. epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts
 rollouts, down counts snapshots. A c marks an actor that fetches compact snapshots. rollout is how long an actor takes
-for one, waits how long it then waits for the learner and the network, trip the round trip of a small request.
+for one, waits how long it then waits for the learner and the network, trip the round trip of a small request. Of a
+game with opponents, players are listed by rating; newest wins counts a draw as half a win.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
 0 alive, not begun or ended, 1 not alive or no run directory"""
@@ -246,6 +249,9 @@ def _events(page: EventsPage) -> list[str]:
 
 def _table(status: RunStatus) -> list[str]:
     mean = "-" if status.episode_return_mean is None else short_number(status.episode_return_mean)
+    league = status.league if status.league and status.league.players else None
+    newest = league.newest if league else None
+    rating = f"rating {newest.text}, " if newest else ""
     age = status.checkpoint_age_seconds
     skipped = f" ({status.updates_skipped:,} skipped)" if status.updates_skipped else ""
     agents = "" if status.agent_steps is None else f" ({status.agent_steps:,} agent_steps)"
@@ -254,7 +260,7 @@ def _table(status: RunStatus) -> list[str]:
         f"epoch {status.learner_epoch:x}",
         *(f"  PROBLEM: {problem}" for problem in status.problems),
         *_expiry(status.certificate_days_left),
-        f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}{agents}, "
+        f"  {rating}return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}{agents}, "
         f"updates {status.updates:,}{skipped}",
         *([f"  {status.bottleneck}"] if status.bottleneck else []),
         f"  {short_rate(status.env_steps_per_second)} env_steps/s, {short_rate(status.updates_per_second)} updates/s, "
@@ -264,6 +270,7 @@ def _table(status: RunStatus) -> list[str]:
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}{_usage(status)}",
         *([f"  last order at {status.last_order}"] if status.last_order else []),
+        *(_league_table(league) if league else []),
         *_actor_table(status),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
@@ -271,6 +278,36 @@ def _table(status: RunStatus) -> list[str]:
         *_places(status.actors),
         *map(_refused, status.refused_joins),
     ]
+
+
+def _league_table(league: LeagueStatus) -> list[str]:
+    """Return the players of a game by rating, and how often the newest policy wins against each.
+
+    Of many players, the newest policy and the fixed opponents are shown, and the best versions.
+    """
+    by_rating = sorted(league.players, key=lambda each: -each.rating)
+    named = {NEWEST, *league.fixed_opponents}
+    first = sorted(by_rating, key=lambda each: each.player not in named)[:_MOST_PLAYERS]
+    scores, rows = league.scores_of(NEWEST), [["player", "rating", "+-", "matches", "newest wins"]]
+    for each in (player for player in by_rating if player in first):
+        wins = f"{scores[each.player].win_rate:.0%}" if each.player in scores else "-"
+        numbers = f"{round(each.rating):,}", f"{round(each.deviation):,}", f"{each.matches:,}"
+        rows.append([one_line(each.player)[:_LONGEST_PLAYER], *numbers, wins])
+    more = len(by_rating) - len(first) + league.left_out
+    return [*_aligned(rows, {0}), *([f"  ... and {more:,} more players"] if more else [])]
+
+
+def _aligned(rows: Sequence[Sequence[str]], left: Collection[int]) -> list[str]:
+    """Return the lines of a table. `left` are the columns of words, which are aligned to the left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [
+            text.ljust(width) if at in left else text.rjust(width)
+            for at, (text, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append(f"  {'  '.join(cells)}")
+    return lines
 
 
 _Cell = Callable[[ActorStatus, RunStatus], str]
@@ -324,14 +361,9 @@ def _actor_table(status: RunStatus) -> list[str]:
         if sum(2 + max(map(len, (name, *cells))) for name, cells in columns.items()) <= _WIDTH:
             break
         dropped += [name] if columns.pop(name, None) else []
-    rows = []
-    for row in zip(*((name, *cells) for name, cells in columns.items()), strict=True):
-        cells = []
-        for text, (name, others) in zip(row, columns.items(), strict=True):
-            width = max(map(len, (name, *others)))
-            cells.append(text.ljust(width) if name in _LEFT else text.rjust(width))
-        rows.append(f"  {'  '.join(cells)}")
-    return [*rows, *([f"  --json has more columns: {', '.join(dropped)}"] if dropped else [])]
+    rows = list(zip(*((name, *cells) for name, cells in columns.items()), strict=True))
+    left = [index for index, name in enumerate(columns) if name in _LEFT]
+    return [*_aligned(rows, left), *([f"  --json has more columns: {', '.join(dropped)}"] if dropped else [])]
 
 
 def _measured(seconds: float) -> str:

@@ -54,7 +54,8 @@ from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
-from daedalus.protocol.texts import short_number
+from daedalus.protocol.league import LeagueStatus
+from daedalus.protocol.texts import printable, short_number
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
 
 _TRAIN = """\
@@ -334,7 +335,19 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
         f"on {evaluation['environment']} (backend {evaluation['backend']})"
     )
-    return "\n".join([trained, *_confirmed(run, summary), evaluated, *evaluation["notes"]])
+    if "matches" in evaluation:
+        evaluated = f"evaluation of the newest checkpoint, {evaluation['actions']} actions: {evaluation['summary']}"
+    return "\n".join([trained, *_rated(summary), *_confirmed(run, summary), evaluated, *evaluation["notes"]])
+
+
+def _rated(summary: dict[str, Any]) -> list[str]:
+    """Return the line about the rating of the newest policy in a game with opponents, if it has one."""
+    league = LeagueStatus() if summary.get("league") is None else LeagueStatus.model_validate(summary["league"])
+    if league.newest is None:
+        return []
+    wins = ", ".join(f"{rate:.0%} against {name}" for name, rate in league.win_rates.items())
+    rating = f"league: rating {league.newest.text} of the newest policy"
+    return [printable(f"{rating}; wins {wins}" if wins else rating)]
 
 
 def show(text: str, command: str) -> None:

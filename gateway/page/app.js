@@ -6,6 +6,7 @@ import { byId } from "./dom.js";
 import { Events } from "./events.js";
 import { Fleet } from "./fleet.js";
 import { Folder } from "./folder.js";
+import { League } from "./league.js";
 import { Learning } from "./learning.js";
 import { Orders } from "./orders.js";
 import { Summary } from "./summary.js";
@@ -36,6 +37,7 @@ const connection = new Connection({
 
 const learning = new Learning();
 const summary = new Summary(learning.metrics);
+const league = new League();
 const fleet = new Fleet();
 const events = new Events();
 const folder = new Folder();
@@ -47,6 +49,7 @@ const takers = {
     fleet.count(message.status);
     summary.show(message);
   },
+  league: (message) => league.show(message),
   actors: (message) => fleet.show(message),
   events: (message) => events.show(message),
   folder: (message) => folder.show(message),

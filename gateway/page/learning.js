@@ -6,6 +6,9 @@ import { duration, number } from "./format.js";
 import { Metrics } from "./metrics.js";
 
 const RETURN = { title: "Return", column: "episode_return_mean", width: "episode_return_std", wide: true };
+const RATING = { title: "Rating", column: "rating", width: "rating_deviation", wide: true };
+const WIN_RATE = "win_rate/"; // columns of the win rates against fixed opponents
+const MOST_WIN_RATES = 6; // with a chart of their own; others can be added
 const CHARTS = [
   { title: "Entropy (nats)", column: "entropy" },
   { title: "Value loss", column: "value_loss" },
@@ -36,6 +39,7 @@ export class Learning {
     this.#smoothing.append(...options(Object.keys(SMOOTHING)));
     this.#further.append(element("option", { value: "" }, "choose"));
     this.#add(RETURN, byId("return"));
+    this.#add(RATING, byId("rating"));
     for (const definition of CHARTS) this.#add(definition);
     this.#axis.onchange = () => this.#choose(null);
     this.#part.onchange = () => this.#choose(null, this.#part.value);
@@ -49,6 +53,7 @@ export class Learning {
 
   add(message) {
     this.#own.add(message);
+    this.#addWinRates();
     this.#offer();
     this.#drawSoon();
   }
@@ -65,6 +70,14 @@ export class Learning {
     this.#others.push([name, metrics]);
     this.#showLegend();
     this.#drawSoon();
+  }
+
+  #addWinRates() {
+    const shown = this.#charts.map(({ column }) => column);
+    const all = this.#own.names.filter((name) => name.startsWith(WIN_RATE)).slice(0, MOST_WIN_RATES);
+    for (const column of all.filter((name) => !shown.includes(name))) {
+      this.#add({ title: `Win rate against ${column.slice(WIN_RATE.length)}`, column }, byId("win-rates"));
+    }
   }
 
   #add(definition, where = byId("charts")) {

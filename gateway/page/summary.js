@@ -51,7 +51,7 @@ export class Summary {
     this.#progress(status);
     setText(byId("bottleneck"), state === "running" ? status.bottleneck : "");
     this.tiles();
-    document.title = `${status.run}: ${number(status.episode_return_mean)} - Daedalus`;
+    document.title = `${status.run}: ${number(this.metrics.newest("rating") ?? status.episode_return_mean)} - Daedalus`;
   }
 
   /** Show that the gateway is gone, with the last figures. */
@@ -78,8 +78,9 @@ export class Summary {
 
   #result(status) {
     if (status === null) return "";
-    const mean = number(status.episode_return_mean);
-    return `Result: return ${mean} after ${whole(status.env_steps)} env_steps and ${whole(status.updates)} updates.`;
+    const rating = this.metrics.newest("rating");
+    const strength = rating === null ? `return ${number(status.episode_return_mean)}` : `rating ${whole(rating)}`;
+    return `Result: ${strength} after ${whole(status.env_steps)} env_steps and ${whole(status.updates)} updates.`;
   }
 
   #progress(status) {
@@ -99,6 +100,8 @@ export class Summary {
     const deviation = metrics.newest("episode_return_std");
     const evaluated = metrics.newest("evaluation_env_steps");
     const saved = status.checkpoint_age_seconds;
+    const rating = metrics.newest("rating");
+    if (rating !== null) this.#tile("Rating", whole(rating), `± ${whole(metrics.newest("rating_deviation"))}, of the newest policy`);
     this.#tile("Return", number(status.episode_return_mean), deviation === null ? "no episode yet" : `± ${number(deviation)} between episodes`);
     this.#tile(
       "Evaluation",
@@ -120,7 +123,8 @@ export class Summary {
   #tile(title, value, more) {
     if (!this.#tiles.has(title)) {
       const parts = [element("dd", { class: "value" }), element("dd", { class: "more" })];
-      byId("tiles").append(element("div", { class: "tile" }, element("dt", {}, title), ...parts));
+      const place = title === "Rating" ? "prepend" : "append"; // it may come after the others, and says most
+      byId("tiles")[place](element("div", { class: "tile" }, element("dt", {}, title), ...parts));
       this.#tiles.set(title, parts);
     }
     const [large, small] = this.#tiles.get(title);

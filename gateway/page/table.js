@@ -12,7 +12,8 @@ export class Table {
 
   /**
    * `caption` names the table. `sorted` is [column, direction] at first; direction is 1 or -1.
-   * A column is {name, title, text(row), value(row), number, style(row)}; `value` sorts.
+   * A column is {name, title, text(row), value(row), number, style(row)}; `value` sorts. In place of
+   * `text` it may have draw(cell, row).
    */
   constructor(caption, sorted) {
     this.#sorted = sorted;
@@ -75,9 +76,10 @@ export class Table {
 
   #fill(target, row) {
     target.dataset.state = row.state ?? "";
-    this.#columns.forEach(({ text, number, wraps, style }, index) => {
+    this.#columns.forEach(({ text, draw, number, wraps, style }, index) => {
       const cell = target.cells[index];
-      setText(cell, text(row));
+      if (draw) draw(cell, row);
+      else setText(cell, text(row));
       cell.className = `${number ? "number" : wraps ? "text" : ""} ${style?.(row) ?? ""}`.trim();
     });
   }

@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol
 
 from daedalus.gateway.places import Places
 from daedalus.gateway.watching.matches import Matches
+from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import ActorStatus, Event, EventsPage, MetricsReport, Order, RunStatus
 
 
@@ -68,7 +69,7 @@ State = Literal[
     "ended",
 ]
 _DIGITS = 6
-_NOT_FOR_THE_PAGE = {"actors"}
+_NOT_FOR_THE_PAGE = {"actors", "league"}  # which have messages of their own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +91,11 @@ def run_message(seen: Observation) -> dict[str, Any]:
     status = None if seen.status is None else seen.status.model_dump(mode="json", exclude=_NOT_FOR_THE_PAGE)
     ends = seen.folder.ends if seen.folder and seen.state in ("stopped", "ended") else ()
     return {"type": "run", "state": seen.state, "reason": seen.reason, "ends": ends, "status": status}
+
+
+def league_message(league: LeagueStatus | None) -> dict[str, Any]:
+    """Return the message about the players of a game with opponents; `league` is null for any other run."""
+    return {"type": "league", "league": league and league.bounded().model_dump(mode="json")}
 
 
 def folder_message(folder: FolderView, *, readable: bool) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from daedalus.gateway.security import OPERATOR, Guard, RateLimit
 from daedalus.gateway.watching import page_data
 from daedalus.gateway.watching.matches import BeginMatch, Matches, MatchOrder, PlayMove, new_orders
 from daedalus.gateway.watching.page_data import Observation, PageData
+from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import Order
 
 MAX_BYTES = 4096
@@ -197,6 +198,8 @@ class ViewerConnection:
     def _changes(self, seen: Observation) -> list[dict[str, Any]]:
         """Return the messages about what differs from what was sent; all at first, in place of what the page had."""
         sent, messages = self._sent, [page_data.run_message(seen)]
+        if sent is None or _league(seen) != _league(sent):
+            messages.append(page_data.league_message(_league(seen)))
         if sent is None or seen.actors is not sent.actors:
             messages.append(page_data.actors_message(seen.actors))
         if sent is None or seen.events is not sent.events:
@@ -309,3 +312,7 @@ class ViewerConnection:
                 self._orders.put_nowait(message)
             case ViewerHello():
                 raise ClientError("out_of_turn", "a connection has one hello")
+
+
+def _league(seen: Observation) -> LeagueStatus | None:
+    return seen.status and seen.status.league

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daedalus.learner.league.opponent_runs import opponent_run
-from daedalus.learner.league.ratings import LeagueState, Ratings, version_of
+from daedalus.learner.league.ratings import LeagueState, Ratings
 from daedalus.learner.league.versions import KeptVersion, VersionFolder, encoded, thinned
 from daedalus.learner.run.resuming import other_spaces
 from daedalus.learner.run.run_directory import LEAGUE
@@ -30,7 +30,7 @@ from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.saving.sealed import DamagedError, UnreadableError
 from daedalus.protocol.codec import encode
-from daedalus.protocol.league import DEFAULT_PAST_SHARE, LeagueStatus, Matches, Plan, is_bot, version_name
+from daedalus.protocol.league import DEFAULT_PAST_SHARE, LeagueStatus, Matches, Plan, is_bot, version_name, version_of
 from daedalus.protocol.messages import LeaguePlan, Program, Refusal, Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 _PLAN_SECONDS = 5.0  # between two plans that differ in the weights only
 _KEEP_PARTS = 50  # of the budget, after each of which a version is kept by default
 _CACHED_BYTES = 64 << 20  # of encoded snapshots: all actors ask for a new version at about the same time
-_SHOWN_PLAYERS, _SHOWN_SCORES = 48, 256  # in a status, which has limits
 
 _logger = logging.getLogger(__name__)
 
@@ -290,4 +289,4 @@ class League:
         with self._lock:
             if not self._began or self._ratings is None:
                 return None
-            return self._ratings.status(_SHOWN_PLAYERS, _SHOWN_SCORES)
+            return self._ratings.status()

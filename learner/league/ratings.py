@@ -6,7 +6,6 @@ win. One player is the zero of the scale: `random`, or else the first kept versi
 """
 
 import math
-import re
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from daedalus.protocol.league import (
     RatedPlayer,
     Score,
     version_name,
+    version_of,
 )
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spec import LeagueSpec
@@ -44,14 +44,6 @@ _MOST_RETIRED = 512  # players that are gone, whose matches may still end
 _RATING_PAIRS = 16  # beside the newest policy against each fixed opponent
 _CONFIDENT = 100.0  # recent matches, from which a win rate counts as measured
 _Z = NormalDist().inv_cdf(0.975)
-
-_VERSION = re.compile(r"v(0|[1-9]\d{0,18})", re.ASCII)
-
-
-def version_of(player: str) -> int | None:
-    """Return the policy version that a player is, or None if it is none."""
-    match = _VERSION.fullmatch(player)
-    return None if match is None else int(match[1])
 
 
 def _order(player: str) -> tuple[int, int, str]:
@@ -324,37 +316,20 @@ class Ratings:
 
     def state(self) -> LeagueState:
         """Return everything that a checkpoint keeps."""
-        return LeagueState(
-            players=tuple(_rated(player, self._skills[player]) for player in self.players),
-            retired=tuple(_rated(player, skill) for player, skill in self._retired.items()),
-            scores=tuple(self._scores()),
-        )
+        status = self.status()
+        retired = tuple(_rated(player, skill) for player, skill in self._retired.items())
+        return LeagueState(players=status.players, retired=retired, scores=status.scores)
 
-    def status(self, most_players: int, most_scores: int) -> LeagueStatus:
-        """Return the ratings and results for people, of as many players and pairs at most.
-
-        Versions between others go first, and of pairs those without the newest policy that have played least.
-        """
-        players = self.players
-        while len(players) > most_players:
-            inner = [name for name in players if version_of(name) is not None][1::2]
-            if not inner:
-                players = players[:most_players]
-                break
-            gone = set(inner[: len(players) - most_players])
-            players = [name for name in players if name not in gone]
-        scores = [score for score in self._scores() if score.first in players and score.second in players]
-        if len(scores) > most_scores:
-            scores.sort(key=lambda each: (each.first != NEWEST, -(each.wins + each.draws + each.losses)))
+    def status(self) -> LeagueStatus:
+        """Return the ratings and results for people."""
+        pairs = sorted(self._results.items(), key=lambda item: (_order(item[0][0]), _order(item[0][1])))
         return LeagueStatus(
-            players=tuple(_rated(player, self._skills[player]) for player in players),
-            scores=tuple(scores[:most_scores]),
+            players=tuple(_rated(player, self._skills[player]) for player in self.players),
+            scores=tuple(
+                Score(first=first, second=second, wins=results.wins, draws=results.draws, losses=results.losses)
+                for (first, second), results in pairs
+            ),
         )
-
-    def _scores(self) -> Iterator[Score]:
-        for first, second in sorted(self._results, key=lambda pair: (_order(pair[0]), _order(pair[1]))):
-            results = self._results[first, second]
-            yield Score(first=first, second=second, wins=results.wins, draws=results.draws, losses=results.losses)
 
 
 def _rated(player: str, skill: _Skill) -> RatedPlayer:

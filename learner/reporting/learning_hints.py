@@ -20,7 +20,8 @@ class LearningHint:
 
     A run has nothing to learn from where all returns are equal. It does not learn where the entropy has collapsed or
     the explained variance stayed below 0, unless the mean return is higher than that of the first episodes, or the
-    newest evaluation better than the first. Runs that were resumed after the first episodes are not judged.
+    newest evaluation better than the first. Runs that were resumed after the first episodes are not judged, nor games
+    with opponents, whose returns say nothing about the strength of play.
     """
 
     def __init__(self, budget: int, *, normalizes_rewards: bool) -> None:
@@ -37,6 +38,7 @@ class LearningHint:
     def add(self, row: Mapping[str, float]) -> None:
         """Add a metrics row."""
         progress = row["env_steps"] / self._budget
+        self._judged = self._judged or "rating" in row
         if self._judged:
             return
         has_returns = "episode_return_mean" in row  # not before the first episode, and after a target not confirmed

@@ -2,12 +2,16 @@
 
 import csv
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+
+from daedalus.protocol.keys import as_name
+from daedalus.protocol.league import LeagueStatus
 
 # By the group that TensorBoard shows them in. docs/reference/metrics.md explains each column.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -52,6 +56,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "evaluation_length_mean",
         "evaluation_env_steps",
     ),
+    "league": ("rating", "rating_deviation"),
 }
 COLUMNS = tuple(name for names in GROUPS.values() for name in names)
 # Means since the row before, with the counter whose increase since then is their weight. Of all other columns, a row
@@ -78,6 +83,7 @@ MEANS = {
 # Prefixes of columns that a run adds to COLUMNS.
 ENV = "env/"  # scalars of the environment's info
 USER = "user/"  # metrics of the program that started the run
+WIN_RATE = "win_rate/"  # of the newest policy against a fixed opponent
 MAX_COLUMNS = 1024  # that are read; a program of the user's may name a new metric in every row
 
 
@@ -111,13 +117,29 @@ class MetricsWriter(Protocol):
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """Write a row. Raises OSError.
 
-        Its keys are in COLUMNS, or begin with ENV or USER. Columns without a value yet are absent.
+        Its keys are in COLUMNS, or begin with ENV, USER or WIN_RATE. Columns without a value yet are absent.
         """
         ...
 
     def close(self) -> None:
         """Write buffered rows and close the files. Raises OSError."""
         ...
+
+
+def league_columns(league: LeagueStatus) -> dict[str, float]:
+    """Return the columns of a game with opponents: the rating of the newest policy, and its win rates."""
+    newest = league.newest
+    if newest is None:
+        return {}
+    rates = {_opponent_column(name): rate for name, rate in league.win_rates.items()}
+    return {"rating": newest.rating, "rating_deviation": newest.deviation, **rates}
+
+
+def _opponent_column(name: str) -> str:
+    """Return the column of an opponent, `win_rate/my_module.Bot`, in characters that every tracker takes."""
+    plain = name.replace(":", ".")
+    kept = len(plain) <= 64 and re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", plain, re.ASCII)
+    return WIN_RATE + (plain if kept else as_name(name))
 
 
 def read_rows(path: Path) -> Iterator[dict[str, float]]:

@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import TextIO
 
+from daedalus.learner.reporting.metrics_rows import WIN_RATE
 from daedalus.protocol.texts import policy_lag, short_number, short_rate
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
+_SHOWN_OPPONENTS = 2  # in the line
 
 
 _logger = logging.getLogger(__name__)
@@ -77,12 +79,11 @@ def is_terminal(stream: TextIO) -> bool:
 def _parts(row: Mapping[str, float], budget: int, updates_per_batch: int) -> list[str]:
     """Return the parts of a line, the most important first. What is not known yet is a dash."""
     rate, updates = row.get("env_steps_per_second", 0.0), row.get("updates_per_second")
-    mean = short_number(row["episode_return_mean"]) if "episode_return_mean" in row else "-"
     lag = policy_lag(row["policy_lag_mean"], updates_per_batch) if "policy_lag_mean" in row else "-"
     left = duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
     parts = [
         f"{row['wall_seconds']:7.1f} s",
-        f"return {mean:>7}",
+        _strength(row),
         f"env_steps {row['env_steps']:>11,} ({100.0 * row['env_steps'] / budget:.0f} %)",
         f"{short_rate(rate) if rate else '-':>7}/s",
         f"left {left:>6}",
@@ -92,7 +93,18 @@ def _parts(row: Mapping[str, float], budget: int, updates_per_batch: int) -> lis
     ]
     if "episode_length_mean" in row:
         parts.insert(5, f"length {row['episode_length_mean']:>6,.0f}")
+    rates = [f"{name.removeprefix(WIN_RATE)} {rate:.0%}" for name, rate in row.items() if name.startswith(WIN_RATE)]
+    if rates:
+        parts.insert(2, f"wins against {', '.join(rates[:_SHOWN_OPPONENTS])}")
     return parts
+
+
+def _strength(row: Mapping[str, float]) -> str:
+    """Return how good the policy is. In a game with opponents that is a rating: what one side wins, the other loses."""
+    if "rating" in row:
+        return f"rating {round(row['rating']):>6,} +- {round(row['rating_deviation']):,}"
+    mean = short_number(row["episode_return_mean"]) if "episode_return_mean" in row else "-"
+    return f"return {mean:>7}"
 
 
 def _fitted(parts: list[str], width: int) -> str:

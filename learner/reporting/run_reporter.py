@@ -12,7 +12,7 @@ import numpy as np
 from daedalus.learner.reporting.bottleneck import bottleneck
 from daedalus.learner.reporting.csv_writer import cut_rows
 from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint
-from daedalus.learner.reporting.metrics_rows import ENV, Details, read_rows
+from daedalus.learner.reporting.metrics_rows import ENV, Details, league_columns, read_rows
 from daedalus.learner.reporting.rates import RateMeter
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
@@ -24,6 +24,7 @@ from daedalus.learner.serving.events import RESUMED
 from daedalus.learner.serving.query_responses import page, totals
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.policy.saving.best_checkpoints import set_aside_newer
+from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import RunStatus
 from daedalus.transport.process_usage import UsageMeter
 
@@ -120,6 +121,7 @@ class RunReporter:
                 "updates_skipped": counters.updates_skipped,
                 **learned,
                 **context.evaluations.take_newest(),
+                **league_columns(self._league() or LeagueStatus()),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
                 **self._user_metrics.take(),
@@ -132,6 +134,11 @@ class RunReporter:
         """Return the agent_steps of a game, by their name; nothing for an environment with one agent."""
         game = self._context.spec.environment.is_game
         return {"agent_steps": self._counters.agent_steps} if game else {}
+
+    def _league(self) -> LeagueStatus | None:
+        """Return the league of a game with opponents, bounded; None before it begins, and for other environments."""
+        league = None if self._context.league is None else self._context.league.status()
+        return league and league.bounded()
 
     def _waits_for(self) -> str:
         """Return what the run waits for. Needs the lock."""
@@ -201,7 +208,7 @@ class RunReporter:
             bottleneck=self._bottleneck,
             learning_share=rates.learning_share,
             decoding_share=rates.decoding_share,
-            league=None if context.league is None else context.league.status(),
+            league=self._league(),
         )
 
     def summary(self, *, finished: bool, now: float, stopped_by: str = "") -> dict[str, Any]:
@@ -209,7 +216,7 @@ class RunReporter:
 
         Its env_steps_per_second is over the training of this process.
         """
-        spec, counters = self._context.spec, self._counters
+        spec, counters, league = self._context.spec, self._counters, self._league()
         return {
             "run": self._context.name,
             "algorithm": spec.training.algorithm,
@@ -237,6 +244,7 @@ class RunReporter:
             "rollout_bytes_per_env_step": counters.rollout_bytes / max(counters.accepted_env_steps, 1),
             "snapshots_published": counters.snapshots_published,
             "bottleneck": self._bottleneck,
+            **({} if league is None else {"league": league.model_dump(mode="json")}),
         }
 
     def write_summary(

@@ -1,4 +1,4 @@
-"""Default settings of an environment without a preset, chosen by its spaces and by nothing else about it."""
+"""Default settings of an environment without a preset, chosen by its spaces and seats and by nothing else about it."""
 
 import importlib.resources
 import math
@@ -14,15 +14,17 @@ _LARGE = 128  # pixels of the longer side
 _RGB = 3  # colours, which environment.grey takes
 _MAX_ROLLOUT_BYTES = 48 << 20  # of observations; service.queue_megabytes is 64
 _SHORT = 16  # rows: before a rollout becomes shorter, an actor gets fewer environments
+_FULL_SEATS = 2  # of a game: if there are more, an actor plays fewer copies, for as many rows
 _FULL_NOISE = 2  # numbers of an action: if there are more, each is explored less
 
 
-def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> dict[str, Any]:
+def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = (), seats: int = 1) -> dict[str, Any]:
     """Return the default settings for the spaces of an environment, as a preset has them.
 
     Args:
       spaces: of the environment without transforms; None if they are not known.
       leave_out: components of the observation that are not in `spaces`.
+      seats: agents of a game that the policy plays: each has rows of its own.
     """
     kind = _UNKNOWN if spaces is None else kind_of(spaces)
     file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
@@ -35,18 +37,24 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> di
         settings["training"].pop("entropy_bonus_final", None)
     if kind == "vectors_continuous" and spaces is not None:
         settings["policy"]["initial_std"] = round(settings["policy"]["initial_std"] * _noise_scale(spaces), 2)
+    for section, values in settings.pop("for_two_seats", {}).items():
+        if seats == _FULL_SEATS:
+            settings[section] |= values
+    if seats > _FULL_SEATS:
+        for collection in (settings["collection"], settings["with_memory"]["collection"]):
+            collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)
     if spaces is not None:
-        _fit_rollouts(settings, spaces)
+        _fit_rollouts(settings, spaces, seats)
     if leave_out:
         settings.setdefault("environment", {})["leave_out"] = list(leave_out)
     return settings
 
 
-def _fit_rollouts(settings: dict[str, Any], spaces: Spaces) -> None:
+def _fit_rollouts(settings: dict[str, Any], spaces: Spaces, seats: int) -> None:
     """Make rollouts shorter, and then the environments of an actor fewer, until a message can carry a rollout."""
     environment = settings.get("environment", {})
     resized, grey = environment.get("resize"), environment.get("grey", False)
-    row = 0  # bytes of one environment
+    row = 0  # bytes of one seat
     for space in spaces.observations.values():
         if not isinstance(space, ArraySpace):
             continue
@@ -56,7 +64,7 @@ def _fit_rollouts(settings: dict[str, Any], spaces: Spaces) -> None:
             row += math.prod(resized) * (1 if grey else space.image_shape[0])
     base, with_memory = settings["collection"], settings["with_memory"]["collection"]
     for collection in (base, with_memory):
-        while collection["rollout_length"] * collection["envs_per_actor"] * row > _MAX_ROLLOUT_BYTES:
+        while collection["rollout_length"] * collection["envs_per_actor"] * seats * row > _MAX_ROLLOUT_BYTES:
             if collection["rollout_length"] > _SHORT or collection["envs_per_actor"] == 1:
                 if collection["rollout_length"] == 1:
                     break

@@ -29,7 +29,7 @@ _logger = logging.getLogger(__name__)
 # They define what is learned, and by what: the weights, the statistics of the optimiser and the results so far belong
 # to them.
 _FIXED_SECTIONS = ("environment.", "policy.")
-_FIXED = {"training.algorithm", "training.optimizer", "training.seed", "training.normalize_rewards"}
+_FIXED = {"training.algorithm", "training.optimizer", "training.seed", "training.normalize_rewards", "league.sides"}
 _CHANGEABLE = {"environment.max_episode_steps", "environment.processes"}
 
 

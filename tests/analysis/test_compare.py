@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from league_statuses import LEAGUE
 from recorded_runs import record
 
 from daedalus.cli.commands.compare import compare
@@ -184,3 +185,14 @@ def test_nothing_to_compare_is_one_line(folder: Path, capsys: pytest.CaptureFixt
         assert captured.out == ""
         assert captured.err.count("\n") == 1
         assert captured.err.startswith(f"daedalus compare: {message}")
+
+
+def test_runs_of_games_with_opponents_are_better_compared_by_playing(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(folder / "a", league=LEAGUE)
+    assert compare(["a"]) == 0
+    assert "daedalus evaluate RUN --against RUN2" in capsys.readouterr().out
+    record(folder / "b")
+    assert compare(["b"]) == 0
+    assert "--against" not in capsys.readouterr().out

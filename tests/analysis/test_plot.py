@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from league_statuses import LEAGUE
 from recorded_runs import record
 
 from daedalus.analysis.charts import COLUMNS
@@ -40,6 +41,7 @@ def test_plot_writes_a_picture_of_groups_and_single_runs(
     for seed in (1, 2, 3):
         record(tmp_path / f"five-{seed}", seed=seed, settings=["collection.rollout_length=5"], evaluation=400.0 + seed)
     record(tmp_path / "one", returns=(None, None, 3.0))
+    record(tmp_path / "game", returns=(0.0, 0.0, 0.0), league=LEAGUE)
     picture = tmp_path / "curve.png"
     assert plot([*options, str(tmp_path), "--output", str(picture)]) == 0, capsys.readouterr().err
     assert picture.read_bytes().startswith(b"\x89PNG")

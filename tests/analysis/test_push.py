@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hub_server import TOKEN, HubServer, serving
+from league_statuses import LEAGUE
 from recorded_runs import record
 from saved_runs import CARTPOLE, COUNTING, save
 from test_report_command import GIF, HOSTILE, evaluated, happened
@@ -96,7 +97,9 @@ def test_a_pushed_policy_is_pulled_again(hub: HubServer, capsys: pytest.CaptureF
 
 def test_the_model_card_has_the_results(hub: HubServer) -> None:
     happened(
-        run_of(Path("run"), 4, rollouts_rejected={"stale": 3}), ("started", "", "x"), ("left", "arm-on-host-7", "gone")
+        run_of(Path("run"), 4, rollouts_rejected={"stale": 3}, league=LEAGUE),
+        ("started", "", "x"),
+        ("left", "arm-on-host-7", "gone"),
     )
     assert push(["run", "ada/cart"]) == 0
     card = hub.files("ada/cart")["README.md"]
@@ -115,6 +118,8 @@ def test_the_model_card_has_the_results(hub: HubServer) -> None:
     assert "daedalus evaluate --from-hub ada/cart" in text
     assert "| 95 % bootstrap interval | " in text
     assert "| rollout rejected (times) | 3 |" in text
+    assert "| rating in its league | 1,312 ± 50 |" in text
+    assert "| win rate against random | 97% |" in text
     assert "arm-on-host-7" not in b"".join(hub.files("ada/cart").values()).decode("utf-8", "replace")
 
 

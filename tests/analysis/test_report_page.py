@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import AXE, chromium
+from league_statuses import LEAGUE
 from recorded_runs import record
 from test_report_command import GIF, HOSTILE, evaluated, happened
 
 from daedalus.actor.environments.rendering import FrameRate
 from daedalus.actor.evaluation.video import Video
 from daedalus.cli.commands.report import report
+from daedalus.protocol.league import RatedPlayer
+from daedalus.protocol.texts import printable
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +39,11 @@ def reports(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> list[Path
     (poor / "replay.gif").write_bytes(GIF)
     record(folder / "other", settings=["collection.rollout_length=7"], returns=[None, None, 1.0])
     record(folder / "acrobot", preset="acrobot")
-    assert report([str(rich)]) == report([str(poor)]) == 0
+    players = (RatedPlayer(player=HOSTILE, rating=-1.0, deviation=1.0), *LEAGUE.players)
+    game = record(folder / "game", league=LEAGUE.model_copy(update={"players": players, "left_out": 5}))
+    assert report([str(rich)]) == report([str(poor)]) == report([str(game)]) == 0
     assert report([str(folder), "--output", str(folder / "report.html")]) == 0
-    return [rich / "report.html", poor / "report.html", folder / "report.html"]
+    return [rich / "report.html", poor / "report.html", folder / "report.html", game / "report.html"]
 
 
 @pytest.fixture(params=["light", "dark"])
@@ -61,7 +66,7 @@ def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
     assert complaints == []
 
 
-@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize("index", range(4))
 def test_the_page_shows_what_it_has_without_network(reports: list[Path], opened: Any, index: int) -> None:
     page = opened(reports[index])
     assert page.locator("figure svg").count() >= 4
@@ -82,7 +87,20 @@ def test_the_video_plays(reports: list[Path], opened: Any) -> None:
     assert page.locator("img").evaluate("picture => picture.naturalWidth") == 1
 
 
-@pytest.mark.parametrize("index", range(3))
+def test_a_game_with_opponents_has_ratings_and_a_matrix(reports: list[Path], opened: Any) -> None:
+    page = opened(reports[3])
+    assert page.locator("h2").first.inner_text() == "League"
+    rows = page.get_by_role("region", name="players by rating").locator("tbody tr").all_inner_texts()
+    assert rows[0].split("\t") == ["newest", "1,312 ± 50", "1,200", "-"]
+    assert rows[-1].split("\t") == [printable(HOSTILE), "-1 ± 1", "0", "-"]
+    assert page.locator("text=5 more players are not shown").count() == 1
+    cell = page.locator(".matrix tr:has(th:text-is('v0')) td span").nth(1)
+    assert (cell.inner_text(), cell.get_attribute("class")) == ("75", "wins")
+    assert cell.get_attribute("title") == "v0 against newest: 75% of 40 matches (30 won, 0 drawn, 10 lost)"
+    assert page.locator("figcaption", has_text="win rate against random").count() == 1
+
+
+@pytest.mark.parametrize("index", range(4))
 def test_axe_finds_nothing(reports: list[Path], opened: Any, index: int) -> None:
     if not AXE.exists():
         pytest.skip("axe-core is not installed: run `make examples`")

@@ -4,6 +4,7 @@ import io
 
 import numpy as np
 import pytest
+from league_statuses import LEAGUE
 from rich.console import Console
 from statuses import actor_status, run_status
 
@@ -15,7 +16,7 @@ from daedalus.protocol.messages import MetricsPage, MetricsReport, RunStatus
 def watched(status: RunStatus, *returns: float) -> WatchedRun:
     run = WatchedRun(status)
     run.add_status(status)
-    run.returns = list(returns)
+    run.curve = list(returns)
     return run
 
 
@@ -54,10 +55,10 @@ def test_a_run_keeps_the_returns_of_all_rows_and_knows_its_end() -> None:
     page = MetricsPage(run="mine", learner_epoch=1, columns=("env_steps", "episode_return_mean"))
     values = np.array([[1.0, np.nan], [2.0, 5.0], [3.0, 6.0]])
     run.add_rows(MetricsReport(page=page, numbers=np.array([0, 1, 4]), values=values))
-    assert (run.returns, run.next_row) == ([5.0, 6.0], 5)
+    assert (run.curve, run.next_row) == ([5.0, 6.0], 5)
     for _ in range(3000):
         run.add_rows(MetricsReport(page=page, numbers=np.array([5, 6, 7]), values=values))
-    assert len(run.returns) <= 4096
+    assert len(run.curve) <= 4096
 
 
 def test_a_frame_shows_progress_return_and_actors() -> None:
@@ -73,6 +74,17 @@ def test_a_frame_shows_progress_return_and_actors() -> None:
     assert [row[:2] for row in rows] == [["arm-1", "alive"], ["arm-2", "gone"], ["arm-3", "quarantined"]]
 
 
+def test_a_frame_of_a_game_with_opponents_shows_ratings() -> None:
+    run = WatchedRun(run_status(league=LEAGUE, episode_return_mean=0.0))
+    page = MetricsPage(run="mine", learner_epoch=1, columns=("env_steps", "rating", "episode_return_mean"))
+    run.add_rows(
+        MetricsReport(page=page, numbers=np.array([0, 1]), values=np.array([[1.0, 3.0, 0.0], [2.0, 5.0, 0.0]]))
+    )
+    text = "\n".join(drawn(run))
+    assert "rating    1,312 +- 50  ▁█" in text
+    assert "newest wins against  my_bots:Greedy 75%  random 97%" in text
+
+
 @pytest.mark.parametrize("width", [20, 40, 60, 80, 200])
 @pytest.mark.parametrize("height", [2, 8, 24])
 def test_a_frame_fits_the_terminal(width: int, height: int) -> None:
@@ -83,17 +95,18 @@ def test_a_frame_fits_the_terminal(width: int, height: int) -> None:
             "environment": "e" * 60,
             "problems": ("p" * 300,),
             "env_steps": 10**12,
+            "league": LEAGUE,
         }
     )
     run = watched(status, *map(float, range(500)))
-    run.returns[0] = -1e9
+    run.curve[0] = -1e9
     lines = drawn(run, width=width, height=height)
     assert max(map(len, lines)) <= width
-    assert len(lines) <= max(height - 1, 7)
+    assert len(lines) <= max(height - 1, 8)
     assert width < 40 or lines[2].endswith("█")  # the newest part of the curve
     if height == 24:
-        assert lines[-1] == "... and 15 more"
-        assert sum("actoractor" in line for line in lines) == 15
+        assert lines[-1] == "... and 16 more"
+        assert sum("actoractor" in line for line in lines) == 14
 
 
 def test_a_narrow_terminal_shows_the_most_important_columns() -> None:

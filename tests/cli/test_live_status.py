@@ -78,10 +78,10 @@ def test_each_row_is_queried_once_and_a_restarted_learner_from_the_first() -> No
     learner, stop = Learner(), threading.Event()
     watching: Iterator[Any] = looks(learner.connect, "mine", stop, 0.0)
     (run,) = next(watching)
-    assert run.returns == [1.0, 2.0, 3.0]
+    assert run.curve == [1.0, 2.0, 3.0]
     learner.returns.append(4.0)
     (run,) = next(watching)
-    assert run.returns == [1.0, 2.0, 3.0, 4.0]
+    assert run.curve == [1.0, 2.0, 3.0, 4.0]
     assert learner.asked == [0, 3, 3, 4]
     learner.status = learner.status.model_copy(update={"learner_epoch": 2})
     (run,) = next(watching)

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterable
 
 import pytest
+from league_statuses import LEAGUE
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import Metric
 from prometheus_client.parser import text_string_to_metric_families
@@ -57,8 +58,16 @@ def test_the_values_of_a_run_and_its_actors_are_exported() -> None:
     assert value(samples, "daedalus_actors", run="mine", state="alive") == 2.0
 
 
+def test_the_rating_and_the_win_rates_of_a_game_are_exported() -> None:
+    samples = scraped(run_status(league=LEAGUE))
+    assert value(samples, "daedalus_rating", run="mine") == 1312.5
+    assert value(samples, "daedalus_win_rate", run="mine", opponent="random") == 0.97
+    assert value(samples, "daedalus_win_rate", run="mine", opponent="my_bots:Greedy") == 0.75
+
+
 def test_an_unknown_value_has_no_sample() -> None:
     samples = scraped(run_status(episode_return_mean=None, checkpoint_age_seconds=None))
+    assert value(samples, "daedalus_rating", run="mine") is None
     assert value(samples, "daedalus_episode_return_mean", run="mine") is None
     assert value(samples, "daedalus_checkpoint_age_seconds", run="mine") is None
 

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from league_statuses import LEAGUE
+
 from daedalus.cli.commands.train import report
 from daedalus.launch.local_run import LocalRun
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -27,6 +29,13 @@ def test_notes_of_the_evaluation_are_printed() -> None:
     run = LocalRun(directory=Path("runs/one"), spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1")), started=0.0)
     end = "episodes of the newest checkpoint on CartPole-v1 (backend gymnasium)\n7 of 9 episodes were cut"
     assert report(run, SUMMARY).endswith(end)
+
+
+def test_the_rating_of_a_game_with_opponents_is_printed() -> None:
+    run = LocalRun(directory=Path("runs/one"), spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1")), started=0.0)
+    line = "league: rating 1,312 +- 50 of the newest policy; wins 75% against my_bots:Greedy, 97% against random"
+    assert report(run, {**SUMMARY, "league": LEAGUE.model_dump(mode="json")}).splitlines()[1] == line
+    assert "league" not in report(run, SUMMARY)
 
 
 def test_skipped_updates_are_counted() -> None:

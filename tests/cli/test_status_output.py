@@ -4,11 +4,13 @@ import json
 from collections.abc import Callable
 
 import pytest
+from league_statuses import LEAGUE
 from statuses import actor_status, run_status
 
 from daedalus.cli.commands.status import status as status_command
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
+from daedalus.protocol.league import RatedPlayer
 from daedalus.protocol.messages import Event, EventsPage, EventsReport, RefusedJoin, RunStatus, StatusReport
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -64,6 +66,26 @@ def test_policy_lag_is_shown_in_batches(printed: Print) -> None:
     for part in ("policy lag 0.5 batches (80 updates)", "  1 batch  ", "  2.5 batches  "):
         assert part in shown
     assert "policy lag 0.8 updates" in printed(run_status(policy_lag_mean=0.75))
+
+
+def test_players_of_a_league_are_listed_by_rating(printed: Print) -> None:
+    shown = printed(run_status(league=LEAGUE, episode_return_mean=0.0)).splitlines()
+    assert any(line.startswith("  rating 1,312 +- 50, return 0, env_steps 100 of") for line in shown)
+    begin = next(index for index, line in enumerate(shown) if line.split()[0] == "player")
+    assert [line.split() for line in shown[begin + 1 : begin + 7]] == [
+        ["newest", "1,312", "50", "1,200", "-"],
+        ["v200", "300", "10", "70", "95%"],
+        ["v100", "280", "15", "80", "-"],
+        ["my_bots:Greedy", "250", "10", "60", "75%"],
+        ["v0", "200", "20", "90", "25%"],
+        ["random", "0", "0", "50", "97%"],
+    ]
+    versions = tuple(RatedPlayer(player=f"v{number}", rating=number, deviation=1.0) for number in range(20))
+    many = LEAGUE.model_copy(update={"players": (*LEAGUE.players[:1], *versions, *LEAGUE.players[-2:]), "left_out": 3})
+    shown = printed(run_status(league=many))
+    assert "... and 14 more players" in shown
+    assert all(name in shown for name in ("newest ", "v19 ", "random ", "my_bots:Greedy "))
+    assert json.loads(printed(run_status(league=many), "--json"))["league"]["left_out"] == 3
 
 
 def test_the_epsilon_of_an_actor_that_explores_is_shown(printed: Print) -> None:

@@ -17,8 +17,7 @@ PREAMBLE = """
 # A second lock of the same mutex never returns, and releases the interpreter's lock while it waits.
 STUCK = """
     import ctypes
-    process_lifecycle._STUCK_SECONDS = 0.2
-    process_lifecycle.stop_on_signals(exit_if_stuck=True)
+    process_lifecycle.stop_on_signals(exit_if_stuck=True, stuck_seconds=0.2)
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(128)
     print("ready", flush=True)
     while True:
@@ -27,9 +26,7 @@ STUCK = """
 # A call that Python repeats after each signal, such as a read of a simulator's answer.
 STUCK_IN_PYTHON = """
     import time
-    process_lifecycle._STUCK_SECONDS = 0.2
-    process_lifecycle._END_SECONDS = 1000.0
-    process_lifecycle.stop_on_signals(exit_if_stuck=True)
+    process_lifecycle.stop_on_signals(exit_if_stuck=True, stuck_seconds=0.2, end_seconds=1000.0)
     print("ready", flush=True)
     time.sleep(1000)
 """
@@ -43,8 +40,8 @@ SEEN = """
     seen = threading.Lock()
     seen.acquire()
     process_lifecycle.time = types.SimpleNamespace(monotonic=time.monotonic, sleep=sleep)
-    process_lifecycle._STUCK_SECONDS = 40.0  # even a busy machine notices the stop by then
-    stop = process_lifecycle.stop_on_signals(exit_if_stuck=True)
+    # Even a busy machine notices the stop within 40 s.
+    stop = process_lifecycle.stop_on_signals(exit_if_stuck=True, stuck_seconds=40.0)
     process_lifecycle.exit_with_parent(stop)
     print("ready", flush=True)
 """
@@ -56,7 +53,7 @@ SLOW_END = f"""{SEEN}
 # Between two calls of native code the interpreter calls no handlers, and a signal that comes during the first does not
 # interrupt the wait.
 NATIVE_THEN_WAIT = f"""{SEEN}
-    busy = functools.partial(hashlib.pbkdf2_hmac, "sha256", b"", b"", 3_000_000)
+    busy = functools.partial(hashlib.pbkdf2_hmac, "sha256", b"", b"", 1_000_000)
     list(map(operator.call, (busy, stop.wait)))
     seen.acquire()
     os._exit(8)
@@ -104,8 +101,7 @@ CHILD = """
 BLOCKED_OUTPUT = """
     import logging
     from daedalus.launch.logs import configure_logging
-    process_lifecycle._STUCK_SECONDS = 0.2
-    process_lifecycle.stop_on_signals(exit_if_stuck=True)
+    process_lifecycle.stop_on_signals(exit_if_stuck=True, stuck_seconds=0.2)
     configure_logging(process="actor")
     os.write(1, b"ready\\n")
     os.set_blocking(1, False)

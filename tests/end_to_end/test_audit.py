@@ -23,7 +23,8 @@ def test_the_audit_hook_ends_a_process_that_unpickles() -> None:
 
 def test_training_resuming_and_evaluating_unpickle_nothing(start: Callable[..., Running], tmp_path: Path) -> None:
     saving = ("--set", "service.checkpoint_seconds=0.2", "--set", "evaluation.seconds=0.2")
-    first = start("train", "cartpole", "--env-steps", 60_000, "--run-dir", "run", *saving)
+    few = ("--actors", 1, "--set", "evaluation.episodes=2", "--set", "evaluation.final_episodes=2")
+    first = start("train", "cartpole", "--env-steps", 60_000, "--run-dir", "run", *saving, *few)
     assert first.wait() in (0, 3), first.output
     again = start("resume", "run", "--env-steps", 120_000)
     assert again.wait() in (0, 3), again.output

@@ -7,35 +7,32 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cue_environment
-import pytest
 from processes import Running, until
 
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 
 Start = Callable[..., Running]
 SETTINGS = (
+    "policy.memory=gru",
     "policy.memory_units=32",
     "policy.hidden=[32]",
     "training.target_return=0.95",
     "training.learning_rate=0.003",
     "training.trace_lambda=0.95",
     "collection.envs_per_actor=32",
+    "evaluation.final_episodes=20",
     "collection.rollout_length=12",  # two episodes: the memory is reset within a rollout
 )
 
 
-@pytest.mark.parametrize(("memory", "budget", "status"), [("gru", 200_000, 0), ("none", 50_000, 3)])
-def test_only_a_policy_with_memory_solves_the_cue_task(
-    start: Start, tmp_path: Path, memory: str, budget: int, status: int
-) -> None:
+def test_a_policy_with_memory_solves_the_cue_task(start: Start, tmp_path: Path) -> None:
     """Without memory the return is 0 in the mean, after however many env_steps."""
     shutil.copy(cue_environment.__file__, tmp_path)
-    options = [word for setting in (f"policy.memory={memory}", *SETTINGS) for word in ("--set", setting)]
-    run = ("--env", "cue_environment:Cue-v0", "--algorithm", "impala", "--env-steps", budget, "--run-dir", "run")
+    options = [word for setting in SETTINGS for word in ("--set", setting)]
+    run = ("--env", "cue_environment:Cue-v0", "--algorithm", "impala", "--env-steps", 200_000, "--run-dir", "run")
     running = start("train", *run, *options)
-    assert running.wait() == status, running.output
-    evaluation = json.loads((tmp_path / "run" / "summary.json").read_text())["evaluation_return_mean"]
-    assert evaluation > 0.9 if memory == "gru" else abs(evaluation) < 0.5
+    assert running.wait() == 0, running.output
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["evaluation_return_mean"] > 0.9
 
 
 def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint(start: Start, tmp_path: Path) -> None:

@@ -55,9 +55,12 @@ def keep_version(run: Path, policy_version: int) -> None:
 
 
 def test_a_trained_policy_plays_a_kept_version(tmp_path: Path, start: Start) -> None:
-    words = ("--actors", "1", "--env-steps", "2000", "--set", "evaluation.final_episodes=2", "--run-dir", "run")
+    words = ("--actors", "1", "--env-steps", "2000", "--set", "evaluation.final_episodes=20", "--run-dir", "run")
     training = start("train", "--env", TIC_TAC_TOE.id, *words)
     assert training.wait() in (0, 3), training.output
+    assert re.search(r"evaluation of the newest checkpoint, .* against random: won \d+ of 20 games", training.output)
+    recorded = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert recorded["matches"]["total"]["games"] == len(recorded["returns"]) == 20
     played = start("evaluate", "run", "--against", "v0", "--games", "20", "--actions", "sampled")
     assert played.wait() == 0, played.output
     sides = [line.split()[:2] for line in played.lines[-4:-1]]

@@ -47,15 +47,15 @@ def test_the_agents_of_one_loop_are_one_actor(
     algorithm: str,
     environments: int,
 ) -> None:
-    sizes = ("--set", "collection.rollout_length=64", "--env-steps", 6_000, "--actors", 1, "--run-dir", "run")
+    sizes = ("--set", "collection.rollout_length=64", "--env-steps", 3_000, "--actors", 1, "--run-dir", "run")
     learner = start("learner", "cartpole", "--algorithm", algorithm, *sizes, "--listen", address)
     loop = example("--name", "robots", "--agents", "3", script=AGENTS)
     loop.expect(f"joined run 'run' as 'robots': {environments} x CartPole-v1")
     assert learner.wait() == 3, learner.output  # the budget ended without the target
     assert loop.wait() == 0, loop.output
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["env_steps"] >= 6_000
-    assert summary["episodes"] >= 6_000 // 500 - 3  # of at most 500 env_steps, and one of each agent has not ended
+    assert summary["env_steps"] >= 3_000
+    assert summary["episodes"] >= 3_000 // 500 - 3  # of at most 500 env_steps, and one of each agent has not ended
     assert summary["rollouts_rejected"].keys() <= {"stale"}
 
 

@@ -142,15 +142,6 @@ def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Calla
     assert not processes_mentioning("kept-run")
 
 
-def test_train_on_a_dumb_terminal_prints_plain_lines(at_terminal: Callable[..., AtTerminal]) -> None:
-    running = at_terminal(*ENDLESS, "--run-dir", "plain-run", TERM="dumb")
-    until(lambda: b"updates" in running.raw and b"actors 2" in running.raw)
-    running.type(b"\x03")
-    assert running.wait() == 1
-    assert b"\x1b[1A" not in running.raw
-    assert b"\x1b[?25" not in running.raw
-
-
 def test_a_person_plays_the_policy_at_a_terminal_until_ctrl_c(
     at_terminal: Callable[..., AtTerminal], tmp_path: Path
 ) -> None:

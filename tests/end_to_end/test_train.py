@@ -217,9 +217,8 @@ def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ende
 
 
 def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
-    running = start(
-        "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 400_000
-    )
+    settings = ("--set", "training.stop_when_solved=false", "--set", "evaluation.final_episodes=3", "--log-json")
+    running = start("train", "cartpole", "--run-dir", "run", "--env-steps", 400_000, *settings)
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s.* actors 2")
     (victim,) = [pid for pid in processes_mentioning("actor-1") if pid in processes_mentioning(address)]
@@ -231,6 +230,21 @@ def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, 
     assert recorded[0] == ("started", "")
     assert {("joined", "actor-0"), ("joined", "actor-1"), ("left", "actor-1"), ("restarted", "")} <= {*recorded}
     assert ("ended", "") in recorded
+    expect_each_log_record_as_one_json_object(running)
+
+
+def expect_each_log_record_as_one_json_object(running: Running) -> None:
+    records = [json.loads(line) for line in running.lines if line.startswith("{")]
+    assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
+    assert {"daedalus.launch.local_training", "daedalus.learner.serving.events"} <= {
+        record["logger"] for record in records
+    }
+    plain = [line for line in running.lines if not line.startswith("{")]
+    assert not {record["message"] for record in records} & set(plain)
+    *progress, outcome, evaluation, left = plain
+    assert all(re.search(r"return .* env_steps .* actors \d+$", line) for line in progress), running.output
+    assert (outcome.split(":")[0] in ("solved", "done"), evaluation.split(":")[0]) == (True, "evaluation")
+    assert left == "report: run/report.html"
 
 
 def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path) -> None:
@@ -251,20 +265,3 @@ def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path) -> N
     assert result["solved"] is False
     parameters = safetensors.numpy.load_file(newest_checkpoint(tmp_path / "own") / "parameters.safetensors")
     assert all(np.isfinite(array).all() for array in parameters.values())
-
-
-def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: Start) -> None:
-    settings = ("--set", "evaluation.seconds=0.2", "--set", "evaluation.final_episodes=3")
-    running = start("train", "cartpole", "--log-json", "--env-steps", 20_000, "--run-dir", "run", *settings)
-    assert running.wait() in (0, 3), running.output
-    records = [json.loads(line) for line in running.lines if line.startswith("{")]
-    assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
-    assert {"daedalus.launch.local_training", "daedalus.learner.serving.events"} <= {
-        record["logger"] for record in records
-    }
-    plain = [line for line in running.lines if not line.startswith("{")]
-    assert not {record["message"] for record in records} & set(plain)
-    *progress, outcome, evaluation, left = plain
-    assert all(re.search(r"return .* env_steps .* actors \d+$", line) for line in progress), running.output
-    assert (outcome.split(":")[0] in ("solved", "done"), evaluation.split(":")[0]) == (True, "evaluation")
-    assert left == "report: run/report.html"

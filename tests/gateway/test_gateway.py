@@ -706,7 +706,8 @@ def test_a_gateway_outlives_a_second_run_and_another_release(network: MemoryNetw
     newer[4] += 1
     foreign.serve(keys.join("three", "*"), lambda request: request.reply(bytes(newer)))
     until(lambda: any(line.startswith("the other end uses protocol version") for line in LINES))
-    first, second = ScriptedLearner(network, run="one"), ScriptedLearner(network, run="two")
+    with network.lock:  # the gateway would follow the one that it finds alone
+        first, second = ScriptedLearner(network, run="one"), ScriptedLearner(network, run="two")
     until(lambda: any(line.startswith("several learners answer here (one, two)") for line in LINES))
     first.transport.close()
     foreign.close()

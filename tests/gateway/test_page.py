@@ -15,6 +15,7 @@ import pytest
 from browser import AXE, Visit, chromium
 from certificates import make_certificates
 from gateways import RunningGateway
+from league_statuses import LEAGUE
 from processes import LIMIT, Running, starting, until
 from scripted_learner import SPEC, ScriptedLearner, acknowledge
 from watched import HOSTILE, actor_status, observed, run_status
@@ -22,6 +23,8 @@ from watched import HOSTILE, actor_status, observed, run_status
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import OperatorToken
 from daedalus.gateway.watching.page_data import FolderView
+from daedalus.learner.reporting.metrics_rows import league_columns
+from daedalus.protocol.league import RatedPlayer
 from daedalus.protocol.messages import Event, Order
 from daedalus.transport.connecting import connect
 from daedalus.transport.memory import MemoryNetwork
@@ -255,7 +258,8 @@ def test_the_camera_is_second_and_settings_that_differ_are_first(
         page, visited.loses_gateway = enter(visited.page, TOKEN), True
         page.wait_for_selector("#changed tr")
         order = page.evaluate("[...document.querySelectorAll('main > section')].map((each) => each.id)")
-        assert order[:4] == ["summary", "learning", "camera", "metrics"]
+        assert order[:5] == ["summary", "learning", "league", "camera", "metrics"]
+        assert page.locator("#league").is_hidden()  # of games only
         for selector in ("#changed", "#output"):
             assert HOSTILE in text_of(page, selector)
         assert page.locator("img").count() == 0
@@ -297,6 +301,36 @@ def test_curves_are_smoothed_zoomed_added_and_removed(gateway: RunningGateway, v
     page.get_by_role("button", name="Remove a").click()
     assert page.locator("#charts h3").all_inner_texts()[-1] == "b"
     assert page.locator("#further option").all_inner_texts() == ["choose", "a", "env_steps"]
+
+
+def test_a_game_with_opponents_shows_ratings_and_who_beats_whom(gateway: RunningGateway, visit: Open) -> None:
+    players = (RatedPlayer(player=HOSTILE, rating=1.0, deviation=0.5), *LEAGUE.players)
+    league = LEAGUE.model_copy(update={"players": players, "left_out": 3})
+    rows = [{"env_steps": 10.0 * step, **league_columns(LEAGUE)} for step in range(3)]
+    show(gateway, run_status(league=league), rows)
+    page = visit(f"http://127.0.0.1:{gateway.port}/").page
+    page.wait_for_selector("#matrix tbody tr")
+    assert page.locator("#rating svg").get_attribute("aria-label") == "Rating: 1,313 at the end, from 0 to 20"
+    assert page.locator("#win-rates h3").all_inner_texts() == [
+        "Win rate against my_bots.Greedy",
+        "Win rate against random",
+    ]
+    assert text_of(page, "#tiles .tile:first-child").split("\n") == ["Rating", "1,313", "± 50, of the newest policy"]
+    best = page.locator("#players tbody tr").first
+    assert best.locator("td").all_inner_texts() == ["newest", "1,313 ± 50", "", "1,200", "-"]
+    assert text_of(page, "#players tr:has(td:text-is('random')) td:last-child") == "97 %"
+    assert "3 players more are kept" in text_of(page, "#league-note")
+    cell = page.locator("#matrix tr:has(th:text-is('v0')) td").nth(1)  # hostile, newest, v0, ...
+    assert (cell.inner_text(), cell.get_attribute("class")) == ("75", "number wins")
+    assert cell.get_attribute("title") == "v0 against newest: 75 % of 40 matches (30 won, 0 drawn, 10 lost)"
+    colours = page.locator("#matrix td.number").evaluate_all(
+        "cells => cells.map((each) => getComputedStyle(each).backgroundColor)"
+    )
+    assert len(set(colours)) > 5
+    assert HOSTILE in text_of(page, "#players")
+    assert page.locator("img").count() == 0
+    show(gateway, run_status(), rows)
+    page.wait_for_selector("#league", state="hidden")
 
 
 def test_an_order_that_the_gateway_does_not_receive_or_answer_is_reported(
@@ -405,8 +439,10 @@ def test_page_is_accessible_and_fits(gateway: RunningGateway, visit: Open, schem
     quarantined = actor_status("wing-2", quarantined="its rollouts are not finite")
     actors = (actor_status("wing-1", compact_snapshots=True), quarantined, actor_status("wing-3", alive=False))
     rows = [{"env_steps": 100.0 * step, "episode_return_mean": 1.0 * step, "entropy": 0.5} for step in range(20)]
+    rows = [{**row, **league_columns(LEAGUE)} for row in rows]
     event = Event(time="2026-11-22T13:16:45.123Z", kind="left", actor="wing-3", text="no longer connected", count=1)
-    show(gateway, run_status(actors, problems=("no update for 61 s",)), rows, events=(event,), folder=FOLDER)
+    status = run_status(actors, problems=("no update for 61 s",), league=LEAGUE)
+    show(gateway, status, rows, events=(event,), folder=FOLDER)
     for path, selector in (("", "#return .line"), ("play", "#status"), ("match", "#status")):
         options = {"color_scheme": scheme, "viewport": {"width": width, "height": 800}}
         one = visit(f"http://127.0.0.1:{gateway.port}/{path}", **options)

@@ -134,6 +134,21 @@ def test_a_message_can_carry_a_rollout(where: Spaces, rows: int, environments: i
         assert each["collection"]["rollout_length"] == min(16, rows)
 
 
+@pytest.mark.parametrize(
+    ("where", "seats", "rows", "copies"),
+    [
+        (spaces(CHOICES, VECTOR), 2, 128, 8),
+        (spaces(CHOICES, VECTOR), 4, 128, 4),
+        (spaces(JOINTS, VECTOR), 20, 128, 1),
+        (spaces(JOINTS, image(457, 120, 3)), 20, 64, 1),  # pistonball
+        (spaces(CHOICES, ArraySpace(shape=(512, 512), dtype="float32")), 20, 2, 1),
+    ],
+)
+def test_rollouts_of_many_seats_are_no_larger(where: Spaces, seats: int, rows: int, copies: int) -> None:
+    collection = default_settings(where, seats=seats)["collection"]
+    assert (collection["rollout_length"], collection["envs_per_actor"]) == (rows, copies)
+
+
 def test_components_to_leave_out_become_a_setting() -> None:
     assert default_settings(spaces(CHOICES, VECTOR), ["mission"])["environment"]["leave_out"] == ["mission"]
     assert "environment" not in default_settings(spaces(CHOICES, VECTOR))

@@ -48,6 +48,12 @@ def test_run_that_learns_or_explores_gets_no_hint(last: dict[str, float]) -> Non
     assert hints(row(0.01, -200.0, 1.4), last) == ["", ""]
 
 
+def test_game_with_opponents_whose_mean_return_is_0_by_construction_gets_no_hint() -> None:
+    rows = [row(share, 0.0, entropy) for share, entropy in ((0.01, 1.4), (0.1, 0.1), (0.2, 0.1), (0.3, 0.1))]
+    assert hints(*rows)[2] != ""
+    assert set(hints(*({**each, "rating": 100.0} for each in rows))) == {""}
+
+
 def test_run_whose_return_rises_gets_no_hint_whatever_its_critic_explains() -> None:
     rising = [row(0.1 + 0.02 * index, 5.9 + 2.0 * index, 1.0, -0.1) for index in range(6)]
     assert set(hints(row(0.01, 5.9, 1.0, -5.0), *rising)) == {""}

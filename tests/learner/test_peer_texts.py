@@ -1,6 +1,7 @@
 """Texts of peers: the learner bounds them where they enter its state; its memory and its messages stay small."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import pytest
 from building import ENVIRONMENTS, EPOCH, SPACES, identity, joined_fleet, make_rollout, run_context, run_spec
@@ -10,6 +11,7 @@ from daedalus.learner.serving.query_responses import JoinResponses, page, totals
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.league import LeagueStatus, RatedPlayer, Score
 from daedalus.protocol.limits import STATUS_LIMITS, Limits
 from daedalus.protocol.messages import (
     PAGE_ACTORS,
@@ -55,6 +57,24 @@ def test_the_reason_of_a_quarantine_is_bounded_and_printable() -> None:
     assert fleet._former["a", 1].quarantined == reason
 
 
+def _largest_league(name: str = FACE * 196) -> LeagueStatus:
+    players = ("newest", *(f"v{number}" for number in range(256)), *(f"{name}{number:02d}" for number in range(64)))
+    return LeagueStatus(
+        players=tuple(RatedPlayer(player=each, rating=1.5, deviation=1.5, matches=2**53) for each in players),
+        scores=tuple(Score(first=one, second=other, wins=1.5) for one, other in combinations(players, 2)),
+    )
+
+
+def test_a_league_is_bounded_to_what_a_person_can_read() -> None:
+    shown = _largest_league("bot").bounded()
+    names = [each.player for each in shown.players]
+    assert names[:3] == ["newest", "v0", "v23"]
+    assert names[12:14] == ["v255", "bot00"]
+    assert (len(names), len(shown.scores), shown.left_out) == (24, 24 * 23 // 2, 1 + 256 + 64 - 24)
+    few = LeagueStatus(players=shown.players[:13])
+    assert few.bounded() == few
+
+
 def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
     names = [f"a.{number:02d}".ljust(64, "x") for number in range(PAGE_ACTORS)]
     context = run_context()
@@ -81,6 +101,7 @@ def test_the_largest_status_is_within_the_limits_of_its_readers() -> None:
         rollouts_rejected=dict.fromkeys(CAUSES, 2**53),
         refused_joins=fleet.refused_joins.report(1.0),
         actors=actors,
+        league=_largest_league().bounded(),
         **totals(fleet),
     )
     for message in (

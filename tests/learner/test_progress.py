@@ -4,8 +4,10 @@ import io
 from types import SimpleNamespace
 
 import pytest
+from league_statuses import LEAGUE
 from log_lines import LINES
 
+from daedalus.learner.reporting.metrics_rows import league_columns
 from daedalus.learner.reporting.progress import Progress
 
 CLEAR = "\r\x1b[K"
@@ -145,3 +147,9 @@ def test_small_rates_are_not_shown_as_0(screen: Screen) -> None:
     line = screen.getvalue().split(CLEAR)[-1]
     for part in ("    0.4/s", "left  6.6 h", "updates 0.029/s"):
         assert part in line
+
+
+def test_a_rating_stands_in_place_of_a_return_that_is_0_by_construction(screen: Screen) -> None:
+    Progress(screen, 1000).show(row(100, episode_return_mean=0.0, **league_columns(LEAGUE)))
+    assert "rating  1,312 +- 50  wins against my_bots.Greedy 75%, random 97%" in screen.getvalue()
+    assert "return" not in screen.getvalue()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_context, run_spec
+from league_statuses import LEAGUE
 
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.learning_hints import EpisodeHint
@@ -20,6 +21,7 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.run_context import Health
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS
+from daedalus.protocol.league import LeagueStatus, RatedPlayer
 
 DIAGNOSTICS = (
     *("behaviour_kl", "rho_mean", "rho_effective_share", "rho_clipped_fraction"),
@@ -130,9 +132,33 @@ def test_row_has_every_column_when_all_values_are_known() -> None:
     counters.trained([make_rollout(version=3, valid=EVERYTHING)], 5, 1)
     context.evaluations.newest = {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = reporter.row(learner_with(dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5)), 11.0)
-    assert set(row) == set(COLUMNS) - {"agent_steps"}  # of games only
+    assert set(row) == set(COLUMNS) - {"agent_steps", "rating", "rating_deviation"}  # of games only
     assert (row["wall_seconds"], row["env_steps"], row["updates"]) == (9.5, 36, 2)
     assert (row["actors"], row["rollouts_rejected"], row["policy_lag_max"]) == (1, 3, 2)
+
+
+def test_row_status_and_summary_have_the_league_of_a_game_with_opponents() -> None:
+    league = LEAGUE.model_copy(update={"players": (*LEAGUE.players, *(_version(number) for number in range(300, 400)))})
+    reporter = RunReporter(run_context(league=SimpleNamespace(status=lambda: league)), UserMetrics())
+    row = reporter.row(learner_with({}), 0.0)
+    assert {
+        name: row[name] for name in ("rating", "rating_deviation", "win_rate/random", "win_rate/my_bots.Greedy")
+    } == {
+        "rating": 1312.5,
+        "rating_deviation": 50.0,
+        "win_rate/random": 0.97,
+        "win_rate/my_bots.Greedy": 0.75,
+    }
+    shown = reporter.status(0, 0.0).league
+    assert shown is not None
+    assert (len(shown.players), shown.left_out) == (24, 82)
+    summary = reporter.summary(finished=True, now=0.0)
+    assert LeagueStatus.model_validate(json.loads(json.dumps(summary))["league"]) == shown
+    assert "league" not in RunReporter(run_context(), UserMetrics()).summary(finished=True, now=0.0)
+
+
+def _version(number: int) -> RatedPlayer:
+    return RatedPlayer(player=f"v{number}", rating=1.0, deviation=1.0)
 
 
 def test_first_row_omits_unknown_values() -> None:

@@ -21,6 +21,7 @@ from daedalus.learner.run import run_directory, run_lock
 from daedalus.learner.run.run_lock import LOCK, RunInUseError, RunLock, is_locked
 from daedalus.learner.run.settings import SettingsError, read_preset
 from daedalus.learner.run.settings import run_spec as run_spec_of
+from daedalus.policy.saving.sealed import write_sealed
 from daedalus.protocol.spec import RunSpec
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -326,6 +327,7 @@ def test_a_failed_start_leaves_no_run_directory_but_the_files_of_others(tmp_path
         run_directory.create(tmp_path / name, run_spec())
         (tmp_path / name / "output.log.1").touch()
         (tmp_path / name / "checkpoints").mkdir()
+        write_sealed(tmp_path / name / "league" / "opponent_1", {}, {})
     (tmp_path / "other" / "notes.txt").touch()
     (tmp_path / "trained" / "checkpoints" / "0000000001").mkdir()
     for name in ("failed", "other", "trained"):

@@ -21,7 +21,7 @@ from daedalus.protocol.uploads import Rollout
 from .settings import draw
 from .simulate import services, simulate
 
-SEEDS = 200
+SEEDS = 100
 SEEDS_TO_FIND = 1000  # within which a break must be found
 ROOT = Path(__file__).parent.parent.parent
 
