@@ -9,8 +9,8 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -20,9 +20,12 @@ from daedalus.actor.errors import ActorError, NoLearnerError
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.actor_config import ActorConfig, own_name
 from daedalus.actor.session.actor_service import ActorService
+from daedalus.actor.session.role_actor import RoleActor, Seating
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import FAILED, status_at_start
 from daedalus.policy.acting.runtime import PolicyError
+from daedalus.policy.saving.saved_policy import NoPolicyError
+from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import frames_of, is_of_user
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol import keys
@@ -36,12 +39,13 @@ from daedalus.transport.credentials import (
     credentials_to_connect,
     run_for,
 )
-from daedalus.transport.interface import TransportError, UnreachableError
+from daedalus.transport.interface import Transport, TransportError, UnreachableError
 from daedalus.transport.retries import Retries
 
 _logger = logging.getLogger(__name__)
 
-_REPORTED = (ActorError, EnvironmentSetupError, PolicyError, TransportError)  # each in one line
+# Each in one line
+_REPORTED = (ActorError, DamagedError, EnvironmentSetupError, NoPolicyError, PolicyError, TransportError)
 _LEAVE_SECONDS = 30.0  # for the present rollout to be finished and uploaded: the notice of some spot machines
 _LATE_SECONDS = 0.5  # after which an actor that has not left in time is stopped: a step does not return
 _NEXT_RUN_SECONDS = 2.0  # after a run, before the next is looked for: its learner may answer for some seconds more
@@ -58,6 +62,7 @@ class ActorOptions:
     name: str | None = None  # None: made from the name of the host
     run: str = keys.ANY_RUN
     any_run: bool = False
+    seats: Sequence[tuple[str, str]] = ()  # roles or agents, each with its run; empty: all seats are of `run`
     environments: int | None = None  # None: as the learner asks
     runtime: Literal["onnx", "torch"] = "onnx"
     link: Literal["auto", "lan", "wan"] = "auto"
@@ -89,6 +94,27 @@ class ActorOptions:
             any_run=self.any_run,
         )
 
+    def seatings(self, credentials: Credentials | None) -> list[Seating]:
+        """Return the seats of each run, checked. Raises ValueError or CredentialsError with a message of one line."""
+        if self.seats and (self.evaluator or self.any_run or self.run != keys.ANY_RUN):
+            raise ValueError("--seat names the runs: leave out --run, --any-run and --evaluator")
+        names: dict[str, list[str]] = {}
+        for name, run in self.seats:
+            names.setdefault(run, []).append(name)
+        seatings = [_seating(run, tuple(own), credentials) for run, own in names.items()]
+        if len({each.run for each in seatings}) < len(seatings):
+            raise ValueError("--seat names two run directories of one name, or a run and its directory: choose one")
+        if seatings and all(each.policy is not None for each in seatings):
+            raise ValueError("--seat names run directories only, from which nobody learns: name a run with a learner")
+        return seatings
+
+
+def _seating(run: str, names: tuple[str, ...], credentials: Credentials | None) -> Seating:
+    path = Path(run)
+    if path.name != run:  # a path: no run has a separator in its name
+        return Seating(names=names, run=keys.as_name(path.resolve().name), policy=path)
+    return Seating(names=names, run=run_for(credentials, keys.check_name(run, "run")))
+
 
 class LeaveRequest:
     """Request to this process to leave, because its host is about to end. Any thread may use it."""
@@ -96,7 +122,7 @@ class LeaveRequest:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._by: float | None = None  # on the monotonic clock; None: there was no request
-        self._role: Evaluator | ActorService | None = None  # that takes part in a run
+        self._role: Evaluator | ActorService | RoleActor | None = None  # that takes part in a run
         self._timer: threading.Timer | None = None
 
     @property
@@ -123,7 +149,7 @@ class LeaveRequest:
             self._timer.start()
 
     @contextmanager
-    def reaching(self, role: Evaluator | ActorService) -> Iterator[None]:
+    def reaching(self, role: Evaluator | ActorService | RoleActor) -> Iterator[None]:
         """Let requests reach what takes part in a run."""
         with self._lock:
             self._role = role
@@ -151,7 +177,7 @@ def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, s
     while True:
         try:
             credentials = credentials_to_connect(options.connect, options.tls, "actor")
-            config = options.config(credentials)
+            config, seatings = options.config(credentials), options.seatings(credentials)
             break
         except (ValueError, *SECURITY_ERRORS) as error:
             if not (options.stay and isinstance(error, NotValidNowError)):
@@ -166,7 +192,7 @@ def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, s
 
     while True:
         try:
-            finished = _serve_run(options, config, credentials, stop, leave, note)
+            finished = _serve_run(options, config, seatings, credentials, stop, leave, note)
         except Exception as error:  # broad: see _is_of_others
             if not options.stay or not _is_of_others(error):
                 if not isinstance(error, _REPORTED):
@@ -204,19 +230,32 @@ def _is_of_others(error: Exception) -> bool:
 def _serve_run(
     options: ActorOptions,
     config: ActorConfig,
+    seatings: Sequence[Seating],
     credentials: Credentials | None,
     stop: threading.Event,
     leave: LeaveRequest,
     on_join: Callable[[Welcome], None],
 ) -> bool:
-    """Take part in one run; return whether the run finished. Raises what `main` reports."""
+    """Take part in one run, or in those of the seats; return whether they finished. Raises what `main` reports."""
     config = replace(config, searched_since=time.monotonic())
-    transport = connect_with_retry(options.connect, stop, config.timeout, credentials)
-    if transport is None:
-        return False
-    try:
-        role = (Evaluator if options.evaluator else ActorService)(config, transport, stop, on_join=on_join)
+    with ExitStack() as stack:
+
+        def connect() -> Transport:
+            transport = connect_with_retry(options.connect, stop, config.timeout, credentials)
+            if transport is None:
+                raise _StoppedError
+            return stack.enter_context(closing(transport))
+
+        try:
+            if seatings:
+                role = RoleActor(config, seatings, connect, stop)
+            else:
+                role = (Evaluator if options.evaluator else ActorService)(config, connect(), stop, on_join=on_join)
+        except _StoppedError:
+            return False
         with leave.reaching(role):
             return role.run()
-    finally:
-        transport.close()
+
+
+class _StoppedError(Exception):
+    """The actor was stopped before it was connected."""

@@ -201,6 +201,14 @@ class EnvironmentProblemError(Exception):
     """Error of an environment that cannot be trained on. The message is one line."""
 
 
+class RolesError(EnvironmentProblemError):
+    """Error of a game whose agents need a policy for each role; `roles` are the agents of each."""
+
+    def __init__(self, problem: str, roles: dict[str, tuple[str, ...]]) -> None:
+        super().__init__(problem)
+        self.roles = roles
+
+
 def checked_spaces(spec: RunSpec, *, fork: bool = False) -> Spaces | None:
     """Check the environment of a run of this machine, log warnings, and return its spaces, or None if it takes long.
 
@@ -261,6 +269,8 @@ def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "Envir
         hint = slow_start(spec)
         _logger.warning("the check of the environment was %s: the run starts without it%s", error, hint)
         return EnvironmentReport()
+    if report.roles:
+        raise RolesError(report.problems[0], report.roles)
     if report.problems:
         problem = with_preset(report.problems[0], spec)
         # Nothing is recorded yet: the check has no terminal, and the run no folder.

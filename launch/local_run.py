@@ -100,18 +100,19 @@ def resume_command(run: LocalRun) -> str:
     return shlex.join(["daedalus", "resume", str(run.directory), *allow_settings(run.spec.user_modules)])
 
 
-def learner_arguments(run: LocalRun, address: str, *, first: bool) -> list[str]:
+def learner_arguments(run: LocalRun, address: str, *, first: bool, joins: bool = False) -> list[str]:
     """Return the arguments of the learner, which also listens at an address for the children of this machine.
 
     Args:
       run: the run.
       address: private address of this machine.
       first: whether this is the first learner. After a crash, the next one resumes from the newest checkpoint.
+      joins: connect to a router at that address instead.
     """
     since = run.started if first else time.monotonic()
     addresses = [address, run.listen] if run.listen else [address]
     arguments = ["--prepared", str(run.directory)]
-    arguments += [word for each in addresses for word in ("--listen", each)]
+    arguments += ["--connect", address] if joins else [word for each in addresses for word in ("--listen", each)]
     if run.tls:
         arguments += ["--tls", str(run.tls)]
     if run.insecure:

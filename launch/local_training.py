@@ -75,7 +75,7 @@ def train(
 
     with _observed_address(run) as address:
         spec, options = run.spec, actor_arguments(run)
-        learner = _supervised_learner(run, address, learner_streams)
+        learner = supervised_learner(run, address, learner_streams)
         actors: list[Supervised] = []
         try:
             # One by one: if one cannot be started, those before it are stopped.
@@ -120,12 +120,15 @@ def _observed_address(run: LocalRun) -> Iterator[str]:
             run.observer.end()
 
 
-def _supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams) -> Supervised:
-    """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
+def supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams, *, joins: bool = False) -> Supervised:
+    """Start a learner. After a crash, the next process resumes from the newest checkpoint.
+
+    `joins`: there is a router at the address, which several learners share.
+    """
     descriptors = *run.lock, *run.observer.descriptors
 
     def begin(first: bool) -> Child:
-        arguments = learner_arguments(run, address, first=first)
+        arguments = learner_arguments(run, address, first=first, joins=joins)
         with open_streams("learner") as streams:
             return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
 
@@ -217,7 +220,7 @@ def run_locally(
             if stopping.is_set():
                 raise RunStoppedError
             if status == ORDERED:
-                raise RunStoppedError(_stopped_by(run))
+                raise RunStoppedError(stopped_by(run))
             if status == UNSAVED:
                 raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
             if status not in FINISHED:
@@ -246,7 +249,8 @@ def run_locally(
                 (run.directory / run_directory.OPERATOR_TOKEN).unlink()
 
 
-def _stopped_by(run: LocalRun) -> str:
+def stopped_by(run: LocalRun) -> str:
+    """Return which operator stopped a run, or an empty text."""
     with suppress(SettingsError):  # missing or damaged
         return one_line(str(run_directory.read_json(run.directory / run_directory.SUMMARY).get("stopped_by") or ""))
     return ""

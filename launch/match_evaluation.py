@@ -11,7 +11,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from daedalus.actor.collecting.lineup import sides_of
-from daedalus.actor.environments.bots import Bot, is_bot, make_bot
+from daedalus.actor.environments.bots import Bot, make_bot
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.transforms import TransformedEnvironment
@@ -23,6 +23,7 @@ from daedalus.policy.saving.best_checkpoints import evaluation_result
 from daedalus.policy.saving.hub import HubError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy
 from daedalus.policy.user_code import Surroundings
+from daedalus.protocol.league import is_bot
 
 _MOST_LISTED = 20
 _FEW = 0.5  # share of the games that must differ from all others, unless a note says that they do not

@@ -179,7 +179,7 @@ class Supervised:
 def supervised_actor(
     name: str,
     connect: str,
-    options: tuple[str, ...] = (),
+    options: Sequence[str] = (),
     open_streams: OpenStreams = inherited,
     last_error: Callable[[str], str] = lambda _: "",
     start: StartPlayer = start,
@@ -189,7 +189,7 @@ def supervised_actor(
     Args:
       name: of the actor.
       connect: address of the learner.
-      options: further options of `daedalus actor`.
+      options: further options of `daedalus actor`. The caller may change a list: each start reads it again.
       open_streams: where its output goes.
       last_error: returns the last line of standard error of a process by its name; it says why an actor failed.
       start: starts the process.

@@ -35,7 +35,7 @@ class Row:
 
 
 def match(seed: int, number: int, agents: int, *, together: bool) -> tuple[list[int], list[Step]]:
-    """Return which agents are there at first, and the steps; each agent acts at least once."""
+    """Return which agents are there at first, and the steps; some agents may never act."""
     random = np.random.default_rng([seed, number])
     while True:
         present = sorted(random.choice(agents, random.integers(1, agents + 1), replace=False).tolist())
@@ -43,7 +43,7 @@ def match(seed: int, number: int, agents: int, *, together: bool) -> tuple[list[
         while present and len(steps) < _MOST_STEPS:
             actors = list(present) if together else [int(random.choice(present))]
             acted.update(actors)
-            ends = [agent for agent in present if agent in acted and random.random() < 0.15]
+            ends = [agent for agent in present if random.random() < (0.15 if agent in acted else 0.03)]
             last = len(steps) == _MOST_STEPS - 1
             terminated = [agent for agent in ends if random.random() < 0.5]
             truncated = [agent for agent in (present if last else ends) if agent not in terminated]
@@ -53,7 +53,7 @@ def match(seed: int, number: int, agents: int, *, together: bool) -> tuple[list[
             steps.append(Step(actors, rewards, terminated, truncated, joined))
             gone.update(terminated, truncated)
             present = [agent for agent in (*present, *joined) if agent not in gone]
-        if acted == set(range(agents)):
+        if acted == set(range(agents)) or (acted and random.random() < 0.2):
             return first, steps
 
 
@@ -69,11 +69,17 @@ def rows(seed: int, number: int, agents: int, *, together: bool) -> dict[Key, Ro
         for agent, reward in step.rewards.items():
             if agent in newest:  # else it has no action that could have earned it
                 found[newest[agent]].reward += reward
-        for agent in step.terminated:
+        for agent in newest.keys() & step.terminated:
             found[newest[agent]].terminated = True
-        for agent in step.truncated:
+        for agent in newest.keys() & step.truncated:
             found[newest[agent]].truncated = True
     return found
+
+
+def totals(seed: int, number: int, agents: int, *, together: bool) -> list[float]:
+    """Return the sum of the rewards of each agent in a match, with those that come before its first action."""
+    _, steps = match(seed, number, agents, together=together)
+    return [sum(step.rewards.get(agent, 0.0) for step in steps) for agent in range(agents)]
 
 
 class Scripted:

@@ -19,6 +19,7 @@ class EnvironmentReport(Specification):
     constant_texts: dict[str, str] = Field(default_factory=dict)  # components left out, and their content
     seats: int = 1  # agents of a game that the policy plays
     problems: tuple[str, ...] = ()  # training would fail
+    roles: dict[str, tuple[str, ...]] = Field(default_factory=dict)  # agents by role, if each needs its own policy
     warnings: tuple[str, ...] = ()  # training would run, perhaps not as intended
     notes: tuple[str, ...] = ()  # advice of gymnasium's own checker
     env_steps: int = 0  # played

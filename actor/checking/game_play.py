@@ -14,6 +14,7 @@ from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.gymnasium_environments import limited_close
+from daedalus.actor.environments.roles import DifferentSpacesError
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import unfit_number
@@ -32,6 +33,8 @@ def check_game(
     try:
         modules.check(spec.user_modules)
         games = make_games(spec, 1, modules)
+    except DifferentSpacesError as error:
+        return EnvironmentReport(problems=(str(error),), roles=error.roles)
     except (EnvironmentSetupError, UserModuleError) as error:
         return EnvironmentReport(problems=(str(error),))
     try:

@@ -10,7 +10,7 @@ from daedalus.actor.collecting.lineup import Lineup, rating_copies
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, SeatWriter
 from daedalus.actor.environments.bots import make_bot
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.games import make_games
+from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.environments.vector_environments import VectorEnvironment
@@ -74,7 +74,7 @@ class EnvironmentCollector:
             self._modules.check({**spec.environment.user_modules, **spec.league.user_modules})
         except UserModuleError as error:
             raise EnvironmentSetupError(str(error)) from None
-        games = make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league))
+        games = self._games(spec, count)
         try:
             self.lineup = Lineup(
                 spec.league,
@@ -89,6 +89,9 @@ class EnvironmentCollector:
             raise
         if line := self.lineup.describe():
             _logger.info("%s", line)
+
+    def _games(self, spec: ActorSpec, count: int) -> GameEnvironments:
+        return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league))
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Reset the environments."""

@@ -11,16 +11,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.actor.environments.bots import Bot, is_bot
+from daedalus.actor.environments.bots import Bot
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import GameEnvironments
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
-from daedalus.protocol.league import NEWEST, MatchCount, Matches, Plan, PlannedOpponent, Purpose
+from daedalus.protocol.league import (
+    DEFAULT_PAST_SHARE,
+    NEWEST,
+    MatchCount,
+    Matches,
+    Plan,
+    PlannedOpponent,
+    Purpose,
+    is_bot,
+)
 from daedalus.protocol.spec import LeagueSpec
 
-_PAST_SHARE = 0.2  # of the matches of a game with opponents, unless it is set
 _MOST_POLICIES = 32  # of opponents; beyond it the one that was chosen longest ago is forgotten
 _NEWEST, _BOT = 0, -1  # players of seats; policies of opponents have numbers from 1
 
@@ -108,7 +116,7 @@ class Lineup:
         self._seats, self._copies, self._learned = games.seats, games.count // games.seats, copies
         share = 0.0
         if len(self._sides) > 1:
-            past = _PAST_SHARE if league.past_share is None else league.past_share
+            past = DEFAULT_PAST_SHARE if league.past_share is None else league.past_share
             share = past + sum(league.opponents.values())
         with_opponents = round(share * copies)
         self._alone = copies - with_opponents  # copies with the newest policy in all seats
@@ -291,16 +299,15 @@ class Lineup:
             noise = Noise(*(np.where(greedy[:, None], *pair) for pair in zip(neutral, noise, strict=True)))
         return noise
 
-    def step(self, acted: np.ndarray, rewards: np.ndarray, ended: Sequence[int]) -> list[int]:
+    def step(self, rewards: np.ndarray, ended: Sequence[int]) -> list[int]:
         """Count what a step brought, and return copies whose match is abandoned.
 
         Args:
-          acted: [seats] bool, whether the reward belongs to an action of this match.
-          rewards: [seats].
+          rewards: [seats], also those that come before the first action of an agent.
           ended: copies whose match ended with this step.
         """
         if self.has_opponents:
-            self._scores += np.where(acted, rewards, 0.0)
+            self._scores += rewards
         for copy in ended:
             self._count(copy)
             rates = copy >= self._learned

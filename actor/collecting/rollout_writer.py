@@ -49,21 +49,21 @@ class EpisodeCounter:
             self._returns[self.ended] = 0.0
             self._lengths[self.ended] = 0
 
-    def step_seats(self, acted: np.ndarray, rewards: np.ndarray, ended: np.ndarray, counted: np.ndarray) -> None:
-        """Count a step of the seats that `acted`, with their rewards, and whether their episodes `ended`; all [E].
+    def step_seats(self, seen: np.ndarray, rewards: np.ndarray, ended: np.ndarray, counted: np.ndarray) -> None:
+        """Count a step of the seats that have `seen` something, with their rewards, and whether their episodes `ended`.
 
-        `counted`: whose episodes are reported.
+        All are [E]. `counted`: whose episodes are reported.
         """
-        valid = acted & ~self.ended
+        valid = seen & ~self.ended
         self._returns[valid] += rewards[valid]
         self._lengths += valid
-        ended = valid & ended
-        if np.count_nonzero(ended):
-            reported = ended & counted
+        finished = valid & ended
+        if np.count_nonzero(finished):
+            reported = finished & counted
             self._finished.append((self._returns[reported], self._lengths[reported]))
-            self._returns[ended] = 0.0
-            self._lengths[ended] = 0
-        self.ended = np.where(acted, ended, self.ended)
+            self._returns[finished] = 0.0
+            self._lengths[finished] = 0
+        self.ended = np.where(seen, ended, self.ended)  # a match may also end before a seat has acted in it
 
     def abandon(self, seats: slice) -> None:
         """Forget the running episodes of seats, whose next step is a reset."""
@@ -313,7 +313,7 @@ class SeatWriter(RolloutWriter):
         self._epsilon = np.full((total, 1), options.get("epsilon", 0.0), np.float32)
         self._state = np.zeros((total, self._runtime.state_size), np.float32)
         self._next_state = np.zeros_like(self._state)
-        self._acting, self._begun = np.zeros((2, total), np.bool_)  # has something new; has had an observation
+        self._acting = np.zeros(total, np.bool_)  # has something new
         self._deciding = np.zeros(0, np.int64)  # the seats that the newest policy acts for in this row
         self._chosen = {
             name: np.zeros((total, *actions.shape[2:]), actions.dtype) for name, actions in self._actions.items()
@@ -324,8 +324,11 @@ class SeatWriter(RolloutWriter):
 
     def start(self, observed: Observed) -> None:
         """See RolloutWriter."""
+        assert observed.acting is not None
         self._take_seats(observed)
+        self._episodes.ended[:] = True
         self._show(observed)
+        self._episodes.ended = ~observed.acting  # what the others see first is the beginning of their episodes
 
     def act(self) -> dict[str, np.ndarray]:
         """See RolloutWriter. Only those of the acting seats have an effect."""
@@ -388,7 +391,6 @@ class SeatWriter(RolloutWriter):
         was_over = self._over
         self._take_seats(observed)
         resets = self._episodes.ended
-        acted = observed.acting & self._begun  # seats whose action has an outcome
         # A column may go on with another seat after a row that resets.
         seats = np.flatnonzero(observed.acting & (self._lineup.column >= 0))
         columns = self._lineup.column[seats]
@@ -405,13 +407,14 @@ class SeatWriter(RolloutWriter):
         self._writing[columns] = False
         if self._state.size:
             goes_on = ~resets & np.isfinite(self._next_state).all(axis=1)
-            self._state[acted] = np.where(goes_on[:, None], self._next_state, np.float32(0.0))[acted]
+            state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
+            self._state = np.where(observed.acting[:, None], state, self._state)
         self._show(observed)
         rewards = rewards.astype(np.float32)
         counted = self._lineup.column >= 0
-        abandoned = self._lineup.step(acted & ~resets, rewards, np.flatnonzero(observed.over & ~was_over).tolist())
+        abandoned = self._lineup.step(rewards, np.flatnonzero(observed.over & ~was_over).tolist())
         # Also those that are not written: the agents who act most often would have too few results in the mean.
-        self._episodes.step_seats(acted, rewards, terminated | truncated, counted)
+        self._episodes.step_seats(observed.acting, rewards, terminated | truncated, counted)
         for copy in abandoned:
             self._over[copy] = True
             self._episodes.abandon(slice(copy * self._seats, (copy + 1) * self._seats))
@@ -451,10 +454,8 @@ class SeatWriter(RolloutWriter):
     def _show(self, observed: Observed) -> None:
         """Take what the seats show after a reset or a step."""
         assert observed.acting is not None
-        starts = observed.acting & (self._episodes.ended | ~self._begun)
-        self._stacks.push(observed.frames, starts, observed.acting)
+        self._stacks.push(observed.frames, observed.acting & self._episodes.ended, observed.acting)
         self._current_masks, self._acting = observed.masks, observed.acting
-        self._begun |= observed.acting
 
     def _refuse_absent_seats(self) -> None:
         if self._skipped <= _MOST_SKIPPED * self._rewards.size:

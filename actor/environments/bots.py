@@ -31,11 +31,6 @@ class Bot(Protocol):
         ...
 
 
-def is_bot(player: str) -> bool:
-    """Return whether the name of a fixed opponent is that of a bot: the others are policies."""
-    return player == RANDOM or ":" in player
-
-
 def make_bot(name: str, space: gymnasium.Space, modules: UserModules, setting: str = "league.opponents") -> Bot:
     """Return a new bot, which plays one seat.
 

@@ -94,7 +94,7 @@ class _TurnGame:
         """See GameCopy."""
         self._environment.reset(seed=seed)
         self._turn = None
-        return self._advance()
+        return _some(self._advance())
 
     @property
     def turns(self) -> Sequence[str]:
@@ -133,6 +133,13 @@ class _TurnGame:
         raise _idle()
 
 
+def _some(outcomes: list[Outcome]) -> list[Outcome]:
+    """Return what is new after a reset. Raises EnvironmentSetupError if there is nothing."""
+    if not outcomes:
+        raise EnvironmentSetupError("no agent can act after reset")
+    return outcomes
+
+
 def _idle() -> EnvironmentSetupError:
     return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
 
@@ -148,7 +155,7 @@ class _SimultaneousGame:
         """See GameCopy."""
         observations, infos = self._environment.reset(seed=seed)
         outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
-        return outcomes or self.step({})
+        return _some(outcomes or self.step({}))
 
     @property
     def turns(self) -> Sequence[str]:

@@ -25,9 +25,10 @@ from daedalus.actor.environments.environment_errors import (
     import_extra,
     playing_error,
 )
-from daedalus.actor.environments.game_copies import Outcome, game_copy, without_checks
+from daedalus.actor.environments.game_copies import GameCopy, Outcome, game_copy, without_checks
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
 from daedalus.actor.environments.rendering import frame_rate, render_without_display
+from daedalus.actor.environments.roles import DifferentSpacesError, listed, roles_of
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_code import first_line
@@ -36,7 +37,6 @@ from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
 
 _SHOWN = ("ansi", "rgb_array")  # render modes, the best first
 _AGENT = "agent"  # component of the observation with environment.agent_ids
-_MOST_NAMES = 6  # of agents in a message
 
 _logger = logging.getLogger(__name__)
 
@@ -62,10 +62,7 @@ class GameEnvironments:
         self._numbers = {agent: number for number, agent in enumerate(seats)}
         self._random = [np.random.default_rng(number) for number in range(len(copies))]
         self._others: dict[str, LegalActions] = {}  # of the agents without a seat
-        self._games = [
-            game_copy(environment, seats, partial(self._random_action, number))
-            for number, environment in enumerate(self._environments)
-        ]
+        self._games = self.copies_for(seats)
         self._bots: list[Bot | None] = [None] * self.count  # of the seats, from the next match on
         self._in_match: list[Bot | None] = [None] * self.count
         self._newest: list[tuple[Any, Any]] = [(None, None)] * self.count  # observation and mask of each bot's seat
@@ -89,6 +86,13 @@ class GameEnvironments:
         self.action_mask: Any = None
         self._has_masks: bool | None = None  # in `info`; None before the first reset
         self.reset(0)
+
+    def copies_for(self, agents: Sequence[str]) -> list[GameCopy]:
+        """Return each copy as a game in which these agents have seats; the others take random legal actions."""
+        return [
+            game_copy(environment, agents, partial(self._random_action, number))
+            for number, environment in enumerate(self._environments)
+        ]
 
     @property
     def over(self) -> np.ndarray:
@@ -143,13 +147,12 @@ class GameEnvironments:
                     continue
                 self._begin_match(number)
                 outcomes = self._call("reset", number, None)
-                if not outcomes:
-                    raise EnvironmentSetupError(f"environment {self.name}: no agent can act after reset")
             else:
                 first = number * self.seats
                 chosen = {agent: self._chosen(actions, first + self._numbers[agent]) for agent in game.turns}
                 outcomes = self._call("step", number, chosen)
-            for outcome in self._note(number, outcomes):
+            self._note(number, outcomes)
+            for outcome in outcomes:
                 seat = number * self.seats + self._numbers[outcome.agent]
                 rewards[seat] = outcome.reward
                 terminated[seat], truncated[seat] = outcome.terminated, outcome.truncated
@@ -171,9 +174,8 @@ class GameEnvironments:
             raise playing_error(self.name, call, error) from error
         return outcomes
 
-    def _note(self, number: int, outcomes: list[Outcome]) -> list[Outcome]:
-        """Write what is new for the seats of a copy, and return it; a reward without an action is left out."""
-        noted = []
+    def _note(self, number: int, outcomes: list[Outcome]) -> None:
+        """Write what is new for the seats of a copy."""
         for outcome in outcomes:
             seat = number * self.seats + self._numbers[outcome.agent]
             self._write(seat, outcome)
@@ -182,15 +184,12 @@ class GameEnvironments:
                 self._newest[seat] = outcome.observation, _mask(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:
                 self._warn_of_reward(outcome)
-                outcome = outcome._replace(reward=0.0)
             self._ended[seat] = outcome.terminated or outcome.truncated
             if self._ended[seat]:
                 self._acts[seat] = False
                 if outcome.info:
                     kept = info_to_keep(dict(outcome.info), ended=True)
                     self._episode_info.add({name: np.array([kept[name]]) for name in kept}, np.array([True]))
-            noted.append(outcome)
-        return noted
 
     def _write(self, seat: int, outcome: Outcome) -> None:
         observation = outcome.observation
@@ -242,7 +241,8 @@ class GameEnvironments:
         if not self._warned:
             self._warned = True
             _logger.warning(
-                "environment %s: %s has the reward %g before its first action of a match: such rewards are ignored",
+                "environment %s: %s has the reward %g before its first action of a match: such rewards count in "
+                "results of matches, and are not learned from",
                 self.name,
                 outcome.agent,
                 outcome.reward,
@@ -289,14 +289,19 @@ class GameEnvironments:
     def close(self) -> None:
         """Close all copies, then raise the first exception that one of them raised."""
         environments, self._environments = self._environments, []
-        errors: list[BaseException] = []
-        for environment in environments:
-            try:
-                environment.close()
-            except (Exception, SystemExit) as error:  # of the user's code
-                errors.append(error)
-        if errors:
-            raise EnvironmentSetupError(f"environment {self.name}: close raises {first_line(errors[0])}") from errors[0]
+        close_copies(self.name, environments)
+
+
+def close_copies(name: str, environments: Sequence[Any]) -> None:
+    """Close all copies of a game, then raise the first exception that one of them raised."""
+    errors: list[BaseException] = []
+    for environment in environments:
+        try:
+            environment.close()
+        except (Exception, SystemExit) as error:  # of the user's code
+            errors.append(error)
+    if errors:
+        raise EnvironmentSetupError(f"environment {name}: close raises {first_line(errors[0])}") from errors[0]
 
 
 def _mask(observation: Any, info: Any) -> Any:
@@ -329,19 +334,38 @@ def make_games(
     make = _make_shown if shown else _make
     if render_mode is not None:
         make = partial(_make_rendered, mode=render_mode)
-    copies: list[Any] = []
+    copies = make_copies(spec, count, modules, lambda game: further(_seats(game, spec)), make)
     try:
-        while len(copies) < count:
-            with creation_errors(spec.id, hint_of_count(len(copies), count)):
-                copies.append(make(spec, modules))
-            if len(copies) == 1:
-                seats = _seats(copies[0], spec)
-                count += further(seats)
         return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
     except BaseException:
         for each in copies:
             each.close()
         raise
+
+
+def make_copies(
+    spec: EnvironmentSpec,
+    count: int,
+    modules: UserModules,
+    further: Callable[[Any], int] = lambda _: 0,
+    make: Callable[[EnvironmentSpec, UserModules], Any] | None = None,
+) -> list[Any]:
+    """Return `count` PettingZoo environments of one kind, and as many more as `further` returns for the first.
+
+    `make` makes each of them, in place of what the specification says. See make_games.
+    """
+    copies: list[Any] = []
+    try:
+        while len(copies) < count:
+            with creation_errors(spec.id, hint_of_count(len(copies), count)):
+                copies.append((make or _make)(spec, modules))
+            if len(copies) == 1:
+                count += further(copies[0])
+    except BaseException:
+        for each in copies:
+            each.close()
+        raise
+    return copies
 
 
 def _make_shown(spec: EnvironmentSpec, modules: UserModules) -> Any:
@@ -416,7 +440,11 @@ def _module(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is not None and name.startswith(error.name):
             raise EnvironmentSetupError(f"unknown game {name!r}: {first_line(error)}") from None
-        raise
+        group = name.split(".")[1]  # such as classic: PettingZoo has an extra of that name for what its games need
+        remedy = f'pip install "pettingzoo[{group}]"' if package == "pettingzoo" else "install it"
+        raise EnvironmentSetupError(
+            f"environment {name} needs a package that is not installed ({error.name}): {remedy}"
+        ) from None
 
 
 def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
@@ -425,7 +453,7 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
     unknown = [agent for agent in spec.agents if agent not in possible]
     if unknown:
         raise EnvironmentSetupError(
-            f"environment.agents names {unknown[0]!r}, but the agents of {spec.id} are {_listed(possible)}"
+            f"environment.agents names {unknown[0]!r}, but the agents of {spec.id} are {listed(possible)}"
         )
     chosen = tuple(agent for agent in possible if agent in spec.agents) or possible
     groups: dict[str, list[str]] = {}
@@ -433,18 +461,8 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
         spaces = f"{environment.observation_space(agent)} {environment.action_space(agent)}"
         groups.setdefault(spaces, []).append(agent)
     if len(groups) > 1:
-        parts = "; ".join(_listed(group) for group in groups.values())
-        first = next(iter(groups.values()))
-        raise EnvironmentSetupError(
-            f"the agents of {spec.id} have different spaces ({parts}), and one policy plays agents with the same ones: "
-            f'choose them, as in --set "environment.agents={first}"; the others then take random actions'
-        )
+        raise DifferentSpacesError(spec.id, roles_of(list(groups.values()), possible))
     return chosen
-
-
-def _listed(agents: Sequence[str]) -> str:
-    more = len(agents) - _MOST_NAMES
-    return ", ".join(agents[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _with_agent(space: gymnasium.Space, seats: int) -> gymnasium.spaces.Dict:

@@ -88,7 +88,8 @@ class BackendEnvironments(Protocol):
     """A backend's environments, with their own spaces: they repeat actions and truncate episodes as specified.
 
     Those of games are seats, E over all copies. A step reaches only the seats that are `acting`: those that had
-    something new after the last one. The reward of a seat is the sum since its last action.
+    something new after the last one. The reward of a seat is the sum since its last action; one that comes before its
+    first action of a match counts in the result of the match only.
     """
 
     @property

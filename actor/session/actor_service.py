@@ -68,7 +68,7 @@ class ActorService:
         try:
             return self._thread.run(self._session.play(), self._perform)  # until it raises
         except RunOverError as error:
-            _logger.info("%s", error)
+            _logger.info("run %r: %s", self._session.run, error)
             return error.finished
         except Exception as error:
             self._thread.run(self._session.report_failure(error), to_the_end=True)
@@ -116,6 +116,10 @@ class ActorService:
                 self._upload_maker = make_upload_maker(welcome.spec, action.spaces, self._config.modules)
         return None
 
+    def on_wait(self) -> None:
+        """Do what falls due while a rollout waits for somebody else. Raises what ends the rollout."""
+        self._act_in_rollout(self._session.is_due(time.monotonic()))
+
     def _oppose(self, news: Oppose) -> str:
         """Take a plan or a policy for the games, and return which player's policy is wanted."""
         lineup = self._collector.lineup
@@ -144,7 +148,10 @@ class ActorService:
         return runtime
 
     def _on_row(self) -> None:
-        if self._session.begin_row(time.monotonic()):
+        self._act_in_rollout(self._session.begin_row(time.monotonic()))
+
+    def _act_in_rollout(self, is_due: bool) -> None:
+        if is_due:
             self._thread.call(self._session.act_in_rollout)
         else:
             self._thread.call_after_events(self._session.check_over)

@@ -202,7 +202,7 @@ class ActorSession(PolicySession):
                 welcome = yield from self.find_learner()
                 yield from self._play_with(welcome)
             except LearnerLostError as error:
-                _logger.info("%s", error)
+                _logger.info("run %r: %s", self.run, error)
                 self._plays = self._is_collecting = False
 
     # ------------------------------------------------------------------------------- what ends a session, and waits
@@ -395,6 +395,10 @@ class ActorSession(PolicySession):
         No event changes what this method reads: it is no step.
         """
         self._pace.begin_row(now)
+        return self.is_due(now)
+
+    def is_due(self, now: float) -> bool:
+        """Return whether `act_in_rollout` is due, while no row begins because the rollout waits for somebody else."""
         self._is_fetch_due = self._schedule.is_due(now)
         return self._is_fetch_due or self.leave_by is not None or now >= self.reports.next_at
 

@@ -34,6 +34,7 @@ examples:
   daedalus actor --connect tcp/gpu-box:7447 --allow-module corridor      (the run plays corridor:Corridor-v0)
   daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
   daedalus actor --connect tcp/router:7447 --stay      (serves one run after another)
+  daedalus actor --connect tcp/router:7447 --seat adversary=tag-adversary --seat agent=tag-agent
 
 signals: SIGTERM and SIGINT end an actor after the current step; its unfinished rollout is lost. SIGUSR1 is for a host
 that is about to end: the actor finishes its rollout, uploads it, and ends within 30 s with exit status 0. A rollout
@@ -91,6 +92,16 @@ def _add_connection(options: argparse.ArgumentParser) -> None:
         "--any-run", action="store_true", help="change to another run when the learner of the present one has gone"
     )
     options.add_argument(
+        "--seat",
+        action="append",
+        default=[],
+        type=_seat,
+        metavar="ROLE=RUN",
+        help="let the policy of a run play a role of a game (adversary stands for adversary_0, adversary_1 and so on), "
+        "or one agent. Give it for each role: the actor joins all these runs. In place of a run that is over, its run "
+        "directory: its newest policy plays, and does not learn",
+    )
+    options.add_argument(
         "--name",
         metavar="NAME",
         help="name of this actor. Keep it after a restart (default: made from the name of the host)",
@@ -110,6 +121,13 @@ def _add_connection(options: argparse.ArgumentParser) -> None:
     )
 
 
+def _seat(text: str) -> tuple[str, str]:
+    name, equals, run = text.partition("=")
+    if not (name and equals and run):
+        raise argparse.ArgumentTypeError(f"{text!r} is not ROLE=RUN, such as adversary=tag-adversary")
+    return name, run
+
+
 def actor_options(arguments: argparse.Namespace) -> ActorOptions:
     """Return what the command line asks for."""
     return ActorOptions(
@@ -120,6 +138,7 @@ def actor_options(arguments: argparse.Namespace) -> ActorOptions:
         name=arguments.name,
         run=arguments.run,
         any_run=arguments.any_run,
+        seats=tuple(arguments.seat),
         environments=arguments.envs,
         runtime=arguments.runtime,
         link=arguments.link,

@@ -3,11 +3,18 @@
 import argparse
 import logging
 import math
+import sys
 import threading
 
 from daedalus.cli.arguments import add_insecure, add_logging, add_tls, command_parser
 from daedalus.launch.logs import configure_logging, print_error
-from daedalus.launch.process_lifecycle import raise_descriptor_limit, status_at_start, stop_on_signals
+from daedalus.launch.process_lifecycle import (
+    exit_status,
+    exit_with_parent,
+    raise_descriptor_limit,
+    status_at_start,
+    stop_on_signals,
+)
 from daedalus.transport.addresses import check_connecting, reachable
 from daedalus.transport.connecting import listen
 from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, CredentialsError, credentials_to_listen
@@ -43,9 +50,9 @@ def parser() -> argparse.ArgumentParser:
     options = command_parser("router", _DESCRIPTION, _EXAMPLES)
     options.add_argument(
         "--listen",
-        default=LISTEN,
+        action="append",
         metavar="tcp/HOST:PORT",
-        help="address where learner and actors connect (default: %(default)s)",
+        help=f"address where learner and actors connect (default: {LISTEN}). May be given several times",
     )
     options.add_argument(
         "--connect",
@@ -65,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
     add_tls(options)
     add_insecure(options)
     add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options
 
 
@@ -85,24 +93,27 @@ def router(arguments: list[str]) -> int:
     try:
         if parsed.connect:
             check_connecting(parsed.connect, tls=parsed.tls is not None)
-        credentials = credentials_to_listen([parsed.listen], parsed.tls, "router", insecure=parsed.insecure)
+        addresses = parsed.listen or [LISTEN]
+        credentials = credentials_to_listen(addresses, parsed.tls, "router", insecure=parsed.insecure)
     except SECURITY_ERRORS as error:
         print_error("router", error)
         return status_at_start(error)
     raise_descriptor_limit()
     stop = stop_on_signals()
+    if parsed.exit_with_parent:
+        exit_with_parent(stop)
     try:
         hosts = credentials.hosts() if credentials else []
         limit = int(parsed.max_message_megabytes * 2**20)
-        transport = listen([parsed.listen], parsed.connect, credentials, max_message_bytes=limit)
+        transport = listen(addresses, parsed.connect, credentials, max_message_bytes=limit)
     except (TransportError, CredentialsError) as error:
         print_error("router", error)
         return 1
     try:
         if credentials is None:
-            _logger.info("listening on %s", " and ".join(reachable([parsed.listen])))
+            _logger.info("listening on %s", " and ".join(reachable(addresses)))
         else:
-            _logger.info("listening on %s; the certificate is for %s", parsed.listen, ", ".join(hosts))
+            _logger.info("listening on %s; the certificate is for %s", " and ".join(addresses), ", ".join(hosts))
         _log_unreached(transport, parsed.connect, credentials, stop)
         stop.wait()
     finally:
@@ -126,3 +137,7 @@ def _log_unreached(
         elif logged and not text:
             _logger.info("connected to %s", " and ".join(others))
         logged, pause = text, _LOOK_SECONDS
+
+
+if __name__ == "__main__":
+    sys.exit(exit_status(lambda: router(sys.argv[1:])))

@@ -2,6 +2,8 @@
 
 import argparse
 import importlib.util
+import logging
+import os
 import shlex
 import signal
 import sys
@@ -24,7 +26,7 @@ from daedalus.cli.arguments import (
 from daedalus.cli.screen import Screen, TrainingDisplay
 from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, new_run
 from daedalus.launch.child_output import ChildOutput, inherited
-from daedalus.launch.environment_check import EnvironmentProblemError
+from daedalus.launch.environment_check import EnvironmentProblemError, RolesError
 from daedalus.launch.local_run import (
     LocalRun,
     RunEnd,
@@ -58,6 +60,8 @@ from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.texts import printable, short_number
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
 
+_logger = logging.getLogger(__name__)
+
 _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows their progress. When the training episodes reach the
 target, the policy of that moment plays 100 new sampled episodes (training.target_episodes). Training stops if they
@@ -75,6 +79,7 @@ examples:
   daedalus train cartpole --init-from runs/cartpole-impala-s1-20261121-101500 --set training.learning_rate=0.0001
   daedalus train cartpole --set training.stop_when_solved=false --env-steps 5000000
   daedalus train cartpole --watch                (shows the run in a browser)
+  daedalus train --env mpe2.simple_tag_v3        (its roles have different spaces: a learner and a run for each)
 
 exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
 before the target, 1 failed or stopped, 2 bad usage, 7 a newer learner of the run has taken over"""
@@ -95,7 +100,7 @@ exit status: as of daedalus train"""
 
 # After a signal: for a call that uses the disk, and then for the end of the child processes, of which the learner takes
 # the longest
-_DISK_SECONDS, _END_SECONDS = 10.0, 90.0
+DISK_SECONDS, END_SECONDS = 10.0, 90.0
 
 
 def train(arguments: list[str]) -> int:
@@ -109,11 +114,23 @@ def train(arguments: list[str]) -> int:
         _check_listening(parsed)
         _check_watching(parsed)
         new = new_run(parsed)
+    except (SettingsError, *SECURITY_ERRORS) as error:
+        print_error("train", error)
+        return status_at_start(error)
+    try:
         lock, spec, spaces = create_run(new, fork=True)
+        if parsed.set_role:
+            lock.close()
+            run_directory.remove_failed(lock.directory)
+            raise SettingsError("--set-role is for games whose roles have different spaces: use --set")
+    except RolesError as error:
+        from daedalus.cli.commands.role_runs import train_roles
+
+        return train_roles(parsed, new, error.roles, screen, started)
     except (RunInUseError, EnvironmentProblemError) as error:
         print_error("train", error)
         return 1
-    except (SettingsError, *SECURITY_ERRORS) as error:
+    except SettingsError as error:
         print_error("train", error)
         return status_at_start(error)
     with lock:
@@ -124,7 +141,7 @@ def train(arguments: list[str]) -> int:
             lock=lock.inheritable,
             spaces=spaces,
             init_from=new.init_from,
-            **_machine_options(parsed, lock.directory),
+            **machine_options(parsed, lock.directory),
         )
         return _run(run, screen, lock, exits_with_parent=parsed.exit_with_parent)
 
@@ -139,6 +156,11 @@ def resume(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         _check_watching(parsed)
+        if directories := run_directory.role_directories(parsed.directory):
+            from daedalus.cli.commands.role_runs import resume_roles
+
+            return resume_roles(parsed, directories, screen, started)
+        _warn_of_role(parsed.directory)
         choice = ResumeChoice(
             directory=parsed.directory,
             env_steps=parsed.env_steps,
@@ -166,14 +188,36 @@ def resume(arguments: list[str]) -> int:
         if isinstance(run, FinishedRun):
             say(f"nothing to do: {run.reason}")
             return status_of(run)
-        run = replace(run, **_machine_options(parsed, lock.directory))
+        run = replace(run, **machine_options(parsed, lock.directory))
         return _run(run, screen, lock, exits_with_parent=parsed.exit_with_parent)
+
+
+def _warn_of_role(directory: Path) -> None:
+    """Warn if a run is one of several that play a game together."""
+    parent = Path(os.path.abspath(directory)).parent
+    roles = run_directory.role_directories(parent)
+    if len(roles) > 1 and any(each.samefile(directory) for each in roles.values() if directory.exists()):
+        _logger.warning(
+            "%s is one role of a game: without their runs, the agents of the other roles take random actions. To "
+            "continue all: daedalus resume %s",
+            directory,
+            shlex.quote(str(parent)),
+        )
 
 
 def train_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus train`."""
     options = command_parser("train", _TRAIN, _TRAIN_EXAMPLES)
     add_settings(options)
+    options.add_argument(
+        "--set-role",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("ROLE", "SECTION.KEY=VALUE"),
+        help="a setting of one role's run, in a game whose roles have different spaces and so a run each. --set "
+        "changes those of all roles",
+    )
     add_new_run(options)
     _add_machine_options(options)
     return options
@@ -182,7 +226,9 @@ def train_parser() -> argparse.ArgumentParser:
 def resume_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus resume`."""
     options = command_parser("resume", _RESUME, _RESUME_EXAMPLES)
-    options.add_argument("directory", type=Path, metavar="RUN_DIR", help="run to continue")
+    options.add_argument(
+        "directory", type=Path, metavar="RUN_DIR", help="run to continue, or directory with the runs of several roles"
+    )
     options.add_argument(
         "--env-steps", type=whole_number, metavar="N", help="new budget (default: the budget of the run)"
     )
@@ -242,7 +288,7 @@ def _check_listening(parsed: argparse.Namespace) -> None:
     credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
 
 
-def _machine_options(parsed: argparse.Namespace, directory: Path) -> dict[str, Any]:
+def machine_options(parsed: argparse.Namespace, directory: Path) -> dict[str, Any]:
     """Return the fields of a LocalRun that `_add_machine_options` and `add_log` define."""
     return {
         "listen": parsed.listen,
@@ -269,12 +315,12 @@ def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: boo
         run = replace(run, observer=TrainingDisplay(screen, run_directory.run_name(directory)))
     output = ChildOutput(directory / run_directory.OUTPUT, screen.out, screen.err)
     # A disk that does not answer may hold this thread. The child processes then end with this one, by themselves.
-    stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=_DISK_SECONDS, end_seconds=_END_SECONDS)
+    stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=DISK_SECONDS, end_seconds=END_SECONDS)
     if exits_with_parent:
         exit_with_parent(stopping)
 
     def show_end(end: RunEnd) -> None:
-        show("\n".join([report(run, end.summary), _left_report(directory)]), command)
+        show("\n".join([report(run, end.summary), left_report(directory)]), command)
         lock.close()  # the page that is kept does not keep anybody from resuming the run
         if run.keeps_page:
             say("the page of the run stays open: press Ctrl-C to close it")
@@ -285,7 +331,7 @@ def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: boo
             return run_locally(run, stopping, output, streams, show_end).status
     except RunStoppedError as error:
         by = f" by {error}" if str(error) else ""
-        left, how = _left_report(directory), f"stopped{by}; continue with: {resume_command(run)}"
+        left, how = left_report(directory), f"stopped{by}; continue with: {resume_command(run)}"
         show("\n".join(filter(None, [left, how])), command)
         return 1
     except RunFailedError as error:
@@ -293,14 +339,14 @@ def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: boo
             say(f"{command}: {str(error).rstrip()}", sys.stderr)
         if not (run.resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
-        if left := _left_report(directory):
+        if left := left_report(directory):
             say(left, sys.stderr)
         if not isinstance(error, UnsavedError) and checkpoints(directory):
             say(f"when that is corrected, continue with: {resume_command(run)}", sys.stderr)
         return error.status
 
 
-def _left_report(directory: Path) -> str:
+def left_report(directory: Path) -> str:
     """Write the report of a run; return the line that names it or says why there is none. Empty without metrics."""
     if not (directory / run_directory.METRICS).exists():
         return ""

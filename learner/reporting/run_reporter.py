@@ -99,6 +99,7 @@ class RunReporter:
         """
         learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
         context, counters, fleet = self._context, self._counters, self._context.fleet
+        league = self._league() or LeagueStatus()
         with context.lock:
             progress = context.progress
             context.health.note_actors(len(fleet.live), now)
@@ -121,7 +122,7 @@ class RunReporter:
                 "updates_skipped": counters.updates_skipped,
                 **learned,
                 **context.evaluations.take_newest(),
-                **league_columns(self._league() or LeagueStatus()),
+                **league_columns(league),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
                 **self._user_metrics.take(),

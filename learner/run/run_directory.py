@@ -69,6 +69,18 @@ def default_directory(name: str, spec: RunSpec) -> Path:
     return Path("runs") / f"{plain}-s{spec.training.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
+def role_directory(parent: Path, role: str) -> Path:
+    """Return the directory of the run of one role of a game. Its name is unique beside other runs of the network."""
+    return parent / f"{Path(os.path.abspath(parent)).name}-{re.sub(r'[^A-Za-z0-9._-]+', '-', role)}"
+
+
+def role_directories(parent: Path) -> dict[str, Path]:
+    """Return the directories of the runs in a directory with one run for each role, by role. Empty for any other."""
+    prefix = role_directory(parent, "").name
+    runs = [] if (parent / CONFIG).exists() else [each.parent for each in sorted(parent.glob(f"*/{CONFIG}"))]
+    return {run.name.removeprefix(prefix): run for run in runs if run.name.startswith(prefix)}
+
+
 def check_free(directory: Path) -> None:
     """Check that a directory is free for a new run. Raises SettingsError if it is a file or not empty."""
     if not directory.exists():
@@ -79,6 +91,11 @@ def check_free(directory: Path) -> None:
         raise SettingsError(
             f"run directory {directory} exists: continue the run with `daedalus resume {shlex.quote(str(directory))}`, "
             "or choose another directory with --run-dir"
+        )
+    if role_directories(directory):
+        raise SettingsError(
+            f"run directory {directory} has the runs of several roles: continue them with `daedalus resume "
+            f"{shlex.quote(str(directory))}`, or choose another directory with --run-dir"
         )
     if any(entry.name != LOCK for entry in directory.iterdir()):
         raise SettingsError(

@@ -1,6 +1,7 @@
 """Games with several agents: the rows of each seat, what is refused, and a training of one policy in all seats."""
 
 import re
+import sys
 from typing import Any
 
 import numpy as np
@@ -122,15 +123,11 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
     for (copy, _), playing in members.items():
         if copy >= alone:  # one side only
             assert len({agent // side for agent in playing}) == 1
-    check_results(results, accounts, [first_copy + copy for copy in range(alone, copies)], side)
+    totals = {match: scripted_games.totals(seed, match, agents, together=together) for match in accounts}
+    check_results(results, totals, [first_copy + copy for copy in range(alone, copies)], side)
 
 
-def check_results(
-    results: list[MatchCount],
-    accounts: dict[int, dict[scripted_games.Key, scripted_games.Row]],
-    games: list[int],
-    side: int,
-) -> None:
+def check_results(results: list[MatchCount], totals: dict[int, list[float]], games: list[int], side: int) -> None:
     """Check the results against newest-against-random matches of some games, whoever had which side."""
     assert {(each.purpose, each.first, each.second) for each in results} <= {("training", "newest", "random")}
     most = np.zeros((2, 3))
@@ -139,9 +136,7 @@ def check_results(
         played = {key[0] for number, key in scripted_games.PLAYED if number == game}
         finished += len(played)
         for match in played:
-            means = np.zeros(2)
-            for key, row in accounts[match].items():
-                means[key[1] // side] += row.reward
+            means = [sum(totals[match][:side]), sum(totals[match][side:])]
             for own in range(2):
                 most[own, 1 - int(np.sign(means[own] - means[1 - own]))] += 1
     counted = np.zeros((2, 3))
@@ -350,6 +345,14 @@ def test_games_that_render_no_images_cannot_be_filmed(field: str, reason: str) -
     spec = as_on_gymnasium(EnvironmentSpec(id=game, backend="pettingzoo"))
     with pytest.raises(EnvironmentSetupError, match=f"cannot render rgb_array images: {reason}"):
         make_environments(spec, 1, render_mode="rgb_array", modules=UserModules(frozenset({"test_games"})))
+
+
+def test_a_package_that_a_game_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "pettingzoo.classic.rps_v2", raising=False)
+    monkeypatch.setitem(sys.modules, "pettingzoo.classic.rps.rps", None)
+    game = EnvironmentSpec(id="pettingzoo.classic.rps_v2")
+    (problem,) = check_environment(game, UserModules(), seconds=0.0, env_steps=0).problems
+    assert problem.endswith('(pettingzoo.classic.rps.rps): pip install "pettingzoo[classic]"')
 
 
 def test_one_agent_of_two_may_be_the_policys() -> None:

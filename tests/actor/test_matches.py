@@ -79,7 +79,7 @@ def test_outcomes_are_those_of_a_slow_account(
         for first in range(0, matches, copies):
             number += 1
             account = scripted_games.rows(seed, number, agents, together=kind == "Together")
-            returns = [sum(row.reward for key, row in account.items() if key[1] == agent) for agent in range(agents)]
+            returns = scripted_games.totals(seed, number, agents, together=kind == "Together")
             means = [np.mean([returns[agent] for agent in each]) for each in sides]
             own, best = means[side], max(mean for each, mean in enumerate(means) if each != side)
             for copy in range(min(copies, matches - first)):

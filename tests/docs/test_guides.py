@@ -17,6 +17,7 @@ from plain import PlainEnvironments, act, choices, plain_spaces
 from recorded_runs import record
 
 from daedalus.actor.checking.play import check_environment
+from daedalus.actor.environments.bots import make_bot
 from daedalus.actor.environments.make import make_environments
 from daedalus.algorithms.losses import shares_of
 from daedalus.launch.callbacks import TrainingRun
@@ -64,6 +65,28 @@ def test_the_game_can_be_played(folder: Path) -> None:
     assert (report.problems, report.warnings) == ((), ())
     assert max(report.lengths) == 40
     assert -2.01 < min(report.returns) < 0.0 < max(report.returns) <= 1.0
+
+
+def test_the_game_of_self_play_can_be_played_by_the_bot(folder: Path) -> None:
+    code = example("self_play.md")
+    assert len([line for line in code.splitlines() if line]) <= 40
+    (folder / "rps.py").write_text(code)
+    (folder / "rps_bots.py").write_text(example("self_play.md", number=1))
+    modules = UserModules(frozenset({"rps", "rps_bots"}))
+    report = check_environment(
+        EnvironmentSpec(id="rps:RockPaperScissors", backend="pettingzoo"), modules, seconds=30.0, env_steps=200
+    )
+    assert (report.problems, report.warnings) == ((), ())
+    assert set(report.lengths) == {10}
+    game = importlib.import_module("rps").RockPaperScissors()
+    seen, _ = game.reset()
+    bot = make_bot("rps_bots:Copycat", game.action_space("second"), modules)
+    bot.reset("second", 1)
+    won = []
+    while game.agents:  # against paper again and again
+        seen, rewards, *_ = game.step({"first": 1, "second": bot.act(seen["second"], None)})
+        won.append(rewards["second"])
+    assert won[1:] == [1.0] * 9
 
 
 def test_the_readmes_environment_of_one_s_own_works_as_it_is_pasted(folder: Path) -> None:

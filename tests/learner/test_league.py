@@ -1,6 +1,7 @@
 """learner/league/: kept versions on the disk, plans and policies for actors, other runs as opponents, results."""
 
 import json
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from building import EPOCH, identity, joined_fleet, make_rollout, run_context
+from hypothesis import given
+from hypothesis import strategies as st
 from plain import vector_spaces
 from processes import LIMIT, until
 from saved_runs import save
@@ -222,6 +225,32 @@ def test_rollouts_with_results_of_others_or_impossible_ones_are_unfit(
     assert isinstance(verdict, Rejected) == bool(reason)
     if isinstance(verdict, Rejected):
         assert (verdict.cause, reason in verdict.reason) == ("unfit", True)
+
+
+players = st.sampled_from([NEWEST, "random", "v0", "v7"]) | st.text(min_size=1, max_size=9)
+numbers = st.integers(0, 2**63 - 1)
+counts = st.builds(
+    MatchCount,
+    purpose=st.sampled_from(["training", "rating"]),
+    first=players,
+    second=players,
+    side=st.integers(0, 9),
+    wins=numbers,
+    draws=numbers,
+    losses=numbers,
+)
+
+
+@given(st.lists(counts, max_size=4))
+def test_whatever_matches_an_actor_sends_the_league_goes_on(results: list[MatchCount]) -> None:
+    league = League(Path("nowhere"), game_spec(), EPOCH)
+    league.open(0)
+    sent = Matches(counts=tuple(results))
+    assert isinstance(judged(game_spec(), sent, league), Rollout | Rejected)
+    if not league.violation(sent):
+        league.add(sent)
+    status = league.status()
+    assert status is None or all(math.isfinite(each.rating) for each in status.players)
 
 
 def test_results_of_matches_are_unfit_where_there_is_no_game() -> None:
