@@ -207,6 +207,10 @@ def checked_action(
             high = np.array([np.inf if bound is None else bound for bound in space.high])
             if not (np.isfinite(values) & (values >= low) & (values <= high)).all():
                 raise ValueError(f"{name} must be numbers within {space}")
+            # The run's actions are scaled to [-1, 1] where they have both bounds: see ContinuousSpace.
+            bounded = np.isfinite(low) & np.isfinite(high)
+            first, span = np.where(bounded, low, 0.0), np.where(bounded & (high > low), high - low, 2.0)
+            checked[name] = np.where(bounded, 2.0 * (values - first) / span - 1.0, values).astype(space.dtype)
     return checked
 
 

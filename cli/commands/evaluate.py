@@ -15,6 +15,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episodes import EvaluationStoppedError
 from daedalus.actor.evaluation.video import VideoError
 from daedalus.cli.arguments import add_allow_module, add_logging, allowing, command_parser
+from daedalus.cli.terminal_match import play_at_terminal
 from daedalus.launch.evaluation import run_evaluation
 from daedalus.launch.evaluation_options import EPISODES, GAMES, EvaluationOptions
 from daedalus.launch.logs import configure_logging, print_error, say
@@ -63,6 +64,7 @@ examples:
   daedalus evaluate RUN_DIR --render
   daedalus evaluate RUN_DIR --against random
   daedalus evaluate RUN_DIR --against my_players:Minimax --games 1000 --openings 4
+  daedalus evaluate RUN_DIR --play
   daedalus evaluate --from-hub USER/NAME --revision main
   daedalus evaluate RUN_DIR --allow-module corridor      (the run plays corridor:Corridor-v0)
 
@@ -152,6 +154,10 @@ def _add_opponent(options: argparse.ArgumentParser) -> None:
         help="begin each game with K random moves: two players without chance play one game only otherwise (default: "
         "0)",
     )
+    opponent.add_argument(
+        "--play", action="store_true", help="play against the policy yourself, in this terminal, match after match"
+    )
+    opponent.add_argument("--seat", metavar="NAME", help="your agent in the game, with --play (default: you are asked)")
 
 
 def _add_watching(options: argparse.ArgumentParser) -> None:
@@ -201,6 +207,9 @@ def main(
         return 2
     try:
         with redirect_stdout(sys.stderr):  # the environment may print
+            if arguments.play:
+                play_at_terminal(options, arguments.seat, stop, output or sys.stdout)
+                return 0
             result = run_evaluation(options, stop, sys.stderr)
     except ModuleNotAllowedError as error:
         print_error("evaluate", allowing(error, ["daedalus", "evaluate", *words]))
@@ -224,6 +233,14 @@ def evaluation_options(arguments: argparse.Namespace) -> EvaluationOptions:
         raise ValueError("--record keeps episodes of the policy alone: leave it out, or --against")
     if arguments.record and arguments.max_seconds is not None:
         raise ValueError("--record keeps whole episodes, and --max-seconds cuts them: use one of the two")
+    if arguments.play:
+        others = {"--episodes": arguments.episodes, "--against": arguments.against, "--video": arguments.video}
+        others |= {"--render": arguments.render, "--json": arguments.json, "--record": arguments.record}
+        for name, value in others.items():
+            if value:
+                raise ValueError(f"--play and {name} cannot be used together: leave one out")
+    elif arguments.seat is not None:
+        raise ValueError("--seat is yours in a game with --play: add it, or leave --seat out")
     return EvaluationOptions(
         directory=arguments.directory,
         pretrained=arguments.pretrained,

@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 import scripted_games
+from gymnasium.spaces import Box
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain import PlainPolicy
 
+from daedalus.actor.environments.components import ActionComponents
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.evaluation.person_match import PersonMatch
+from daedalus.actor.evaluation.person_match import PersonMatch, checked_action
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
 MODULES = UserModules(frozenset({"scripted_games"}), "the test")
@@ -68,3 +71,13 @@ def test_environments_without_several_agents_are_refused() -> None:
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}})
     with pytest.raises(EnvironmentSetupError, match="no game with several agents"):
         PersonMatch(spec.for_actors(), MODULES)
+
+
+def test_numbers_of_a_person_are_those_of_the_environment() -> None:
+    space = Box(np.array([0.0, -np.inf, 3.0], np.float32), np.array([10.0, np.inf, 3.0], np.float32))
+    components = ActionComponents(space)
+    spaces = Spaces(observations={"o": ArraySpace(shape=(1,), dtype="float32")}, actions=components.spaces)
+    played = checked_action(spaces, {}, {"action": [2.5, -70.0, 3.0]})
+    assert components.env_actions({"action": played["action"][None]})[0].tolist() == [2.5, -70.0, 3.0]
+    with pytest.raises(ValueError, match="must be numbers within"):
+        checked_action(spaces, {}, {"action": [10.5, 0.0, 3.0]})

@@ -17,7 +17,10 @@ from pathlib import Path
 
 import pytest
 from processes import DAEDALUS, LIMIT, processes_mentioning, until
+from saved_runs import save
 from terminal import Terminal
+
+from daedalus.protocol.spec import EnvironmentSpec
 
 COLUMNS, LINES = 40, 20
 # The program becomes the one that Ctrl-C of this terminal reaches.
@@ -137,3 +140,33 @@ def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Calla
     running.type(b"\x03")
     assert running.wait() == 3  # that of the run
     assert not processes_mentioning("kept-run")
+
+
+def test_a_person_plays_the_policy_at_a_terminal_until_ctrl_c(
+    at_terminal: Callable[..., AtTerminal], tmp_path: Path
+) -> None:
+    save(tmp_path / "run", EnvironmentSpec(id="pettingzoo.classic.tictactoe_v3"), 3)
+    running = at_terminal("evaluate", "run", "--play")
+
+    def asked() -> list[str]:
+        return re.findall(r"^Your move \((.*)\):", running.text, re.MULTILINE)
+
+    until(lambda: running.fault or "[player_1]" in running.text)
+    running.type(b"player_3\n")
+    until(lambda: running.fault or "There is no 'player_3'" in running.text)
+    running.type(b"player_2\n")
+    until(lambda: running.fault or asked())
+    assert "player_1 plays" in running.text
+    running.type(b"12\n")
+    until(lambda: running.fault or len(asked()) == 2)
+    assert "'12' is no legal move" in running.text
+    for turns in range(3, 8):
+        running.type(asked()[-1].split()[0].encode() + b"\n")
+        until(lambda turns=turns: running.fault or len(asked()) == turns or "Another game" in running.text)
+        if "Another game" in running.text:
+            break
+    assert re.search(r"You won|You lost|A draw", running.text), running.text
+    running.type(b"\x03")
+    assert running.wait() == 0, running.text
+    assert running.text.rstrip().endswith("bye")
+    assert running.fault is None
