@@ -58,7 +58,7 @@ def test_end_of_the_run_reaches_actors_whose_rollouts_outlive_the_learner(
     for actor in actors:
         actor.open_gate()
     assert [actor.join() for actor in actors] == [True] * ACTORS
-    assert count("the run is over") == ACTORS
+    assert count("run 'run': the run is over") == ACTORS
     assert count("joined run") == ACTORS
 
 
