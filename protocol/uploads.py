@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from daedalus.protocol.keys import check_name
-from daedalus.protocol.league import Matches
+from daedalus.protocol.league import MAX_SIDES, Matches
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 # A float32 has no number between 16,777,216 and 16,777,218: results of episodes are exact in float64 alone.
@@ -77,7 +77,8 @@ class Rollout:
     # By name [n] float64, or float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
-    # Env_steps of a game with several agents, at most its rows to learn from; None: each of them is one.
+    # Env_steps of a game with several agents, at most its rows to learn from times its sides, for the opponents' steps
+    # count, too; None: each row is one.
     game_steps: int | None = field(default=None, metadata={"sparse": True})
     # Of a game: how the matches ended that ended in this rollout; None: none did.
     matches: Matches | None = field(default=None, metadata={"sparse": True})
@@ -109,7 +110,7 @@ class Rollout:
                 raise ValueError(f"{name} must be [{rows}, {environments}] like rewards, not {array.shape}")
         self._check_dtypes()
         _check_episodes(self)
-        if self.game_steps is not None and not 0 <= self.game_steps <= self.agent_steps:
+        if self.game_steps is not None and not 0 <= self.game_steps <= self.agent_steps * MAX_SIDES:
             raise ValueError(
                 f"game_steps is {self.game_steps}, of a rollout with {self.agent_steps} rows to learn from"
             )

@@ -138,6 +138,11 @@ class Lineup:
         self.plan = Plan(training=tuple(PlannedOpponent(player=name, weight=each) for name, each in fixed.items()))
         self.wanted = ""  # a player whose policy was to play and is not here; empty if there is none
 
+    @property
+    def sides(self) -> int:
+        """Number of sides of the game."""
+        return len(self._sides)
+
     def describe(self) -> str:
         """Return what the copies play, in one line; empty if there are no opponents."""
         if len(self._sides) < 2:

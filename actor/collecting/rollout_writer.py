@@ -355,8 +355,7 @@ class SeatWriter(RolloutWriter):
             for name, frames in self._stacks.frames.items():
                 self._frames[name][: self._depths[name], columns[first]] = frames[seats[first]].swapaxes(0, 1)
             self._initial_state[columns[first]] = self._state[seats[first]]
-        valid = seats[writes & ~self._episodes.ended[seats]]
-        self._env_steps += len(np.unique(valid // self._seats))
+        self._env_steps += self._steps_that_count(seats[writes & ~self._episodes.ended[seats]])
         self._skipped += len(writes) - int(np.count_nonzero(writes))
         self._refuse_absent_seats()
         seats = self._deciding
@@ -367,6 +366,21 @@ class SeatWriter(RolloutWriter):
             self._epsilon[seats],
             self._lineup.noise(self._runtime.noise_size, seats, self._random),
         )
+
+    def _steps_that_count(self, written: np.ndarray) -> int:
+        """Return in how many copies this step counts.
+
+        It does where a row of a seat in `written` begins that is learned from, and where an opponent acts in a match
+        that such rows are written of.
+        """
+        copies = np.zeros(len(self._over), np.bool_)
+        copies[written // self._seats] = True
+        if self._lineup.has_opponents:
+            columns = self._lineup.column.reshape(-1, self._seats)
+            learned = (columns >= 0) & (self._rows[columns] < len(self._rewards))
+            others = (self._acting & ~self._lineup.is_newest).reshape(-1, self._seats).any(axis=1)
+            copies |= learned.any(axis=1) & others & ~self._over
+        return int(np.count_nonzero(copies))
 
     def take_choice(self, choice: Choice) -> None:
         """See RolloutWriter."""
@@ -431,7 +445,8 @@ class SeatWriter(RolloutWriter):
                 "more than half of the agents' steps are not learned from, for some agents act much more often than "
                 "others: each has as many rows in a rollout (environment.agents chooses the agents)"
             )
-        rollout = replace(rollout, game_steps=self._env_steps, matches=self._lineup.take_matches())
+        most = rollout.agent_steps * self._lineup.sides  # the learner takes no more
+        rollout = replace(rollout, game_steps=min(self._env_steps, most), matches=self._lineup.take_matches())
         self._rows[:] = 0
         self._env_steps = self._skipped = 0
         return rollout

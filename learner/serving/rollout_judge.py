@@ -284,6 +284,12 @@ class RolloutJudge:
         environment = self._spec.environment
         if rollout.game_steps is not None and not environment.is_game:
             return "game_steps is set, but the run plays no game with several agents"
+        sides = len(self._spec.league.sides) or 2
+        if rollout.game_steps is not None and rollout.game_steps > rollout.agent_steps * sides:
+            return (
+                f"game_steps is {rollout.game_steps}, of {rollout.agent_steps} rows to learn from in a game with "
+                f"{sides} sides: one row has at most as many steps"
+            )
         if rollout.matches is not None:
             if self._league is None:
                 return "matches is set, but the run plays no game with several agents"
