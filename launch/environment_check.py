@@ -47,6 +47,7 @@ class EnvironmentCheck:
     most_seconds: float  # for the whole check
     shown: bool = False  # show what the environment prints, on standard error, and the end of one that crashes
     notes: bool = False  # add what gymnasium's own checker says
+    bots: tuple[str, ...] = ()  # fixed opponents of a game that are code
 
     def run(self) -> "EnvironmentReport":
         """Check the environment in this process."""
@@ -54,7 +55,7 @@ class EnvironmentCheck:
         from daedalus.actor.checking.play import check_environment
 
         report = check_environment(
-            self.spec, self.modules, seconds=self.seconds, env_steps=self.env_steps, seed=self.seed
+            self.spec, self.modules, seconds=self.seconds, env_steps=self.env_steps, seed=self.seed, bots=self.bots
         )
         if not self.notes or report.problems:
             return report
@@ -63,7 +64,8 @@ class EnvironmentCheck:
     def words(self) -> str:
         """Return the check as text, for `from_words` in another process."""
         plain = {
-            name: getattr(self, name) for name in ("seconds", "env_steps", "seed", "most_seconds", "shown", "notes")
+            name: getattr(self, name)
+            for name in ("seconds", "env_steps", "seed", "most_seconds", "shown", "notes", "bots")
         }
         return json.dumps({**plain, "spec": self.spec.model_dump(mode="json"), "modules": sorted(self.modules.allowed)})
 
@@ -72,7 +74,8 @@ class EnvironmentCheck:
         """Return the check of `words`."""
         values: dict[str, Any] = json.loads(words)
         spec = EnvironmentSpec.model_validate(values.pop("spec"))
-        return cls(**values | {"spec": spec, "modules": UserModules(frozenset(values["modules"]))})
+        modules = UserModules(frozenset(values["modules"]))
+        return cls(**values | {"spec": spec, "modules": modules, "bots": tuple(values["bots"])})
 
 
 def check_in_process(

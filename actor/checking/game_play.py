@@ -1,6 +1,7 @@
 """Plays one copy of a game with several agents, all with random actions, and reports what it does. No threads."""
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -9,7 +10,7 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from daedalus.actor.checking.check_report import EnvironmentReport
 from daedalus.actor.checking.violations import observation_violations
-from daedalus.actor.environments.bots import RandomActions
+from daedalus.actor.environments.bots import RandomActions, make_bot
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import make_games
@@ -24,11 +25,17 @@ _LOOKED_AT = 200  # steps whose observations are compared with their space: it t
 
 
 def check_game(
-    spec: EnvironmentSpec, modules: UserModules, *, seconds: float, env_steps: int, seed: int
+    spec: EnvironmentSpec,
+    modules: UserModules,
+    *,
+    seconds: float,
+    env_steps: int,
+    seed: int,
+    bots: Sequence[str] = (),
 ) -> EnvironmentReport:
     """Make one copy of a game, play it with random actions in all seats, and close it. See check_environment.
 
-    The return of an episode is the mean over the agents.
+    Then each of the `bots` plays a match in all seats. The return of an episode is the mean over the agents.
     """
     try:
         modules.check(spec.user_modules)
@@ -42,7 +49,10 @@ def check_game(
         report = EnvironmentReport(spaces=environments.spaces, seats=environments.seats)
         if seconds == 0.0:
             return report
-        return report.model_copy(update=_played(environments, games, spec, seconds, env_steps, seed))
+        report = report.model_copy(update=_played(environments, games, spec, seconds, env_steps, seed))
+        for bot in bots:
+            _play_bot(environments, games, bot, modules, seed)
+        return report
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     finally:
@@ -96,6 +106,20 @@ def _played(
         "lengths": tuple(lengths),
         "returns": tuple(returns),
     }
+
+
+def _play_bot(environments: TransformedEnvironment, games: Any, bot: str, modules: UserModules, seed: int) -> None:
+    """Let a bot play one match, or the beginning of a long one. Raises EnvironmentSetupError for a fault of the bot."""
+    for seat in range(games.count):
+        games.seat_bot(seat, make_bot(bot, games.action_space, modules))
+    observed = environments.reset(seed)
+    unused = {
+        name: np.zeros((games.count, space.size), space.dtype) for name, space in environments.spaces.actions.items()
+    }
+    for _ in range(_LOOKED_AT):
+        if observed.over is not None and observed.over[0]:
+            break
+        observed, *_ = environments.step(unused)
 
 
 def _refuse_unfit(games: Any, frames: dict[str, np.ndarray], rewards: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -192,7 +192,13 @@ class _ProblemError(Exception):
 
 
 def check_environment(
-    spec: EnvironmentSpec, modules: UserModules, *, seconds: float, env_steps: int, seed: int = 0
+    spec: EnvironmentSpec,
+    modules: UserModules,
+    *,
+    seconds: float,
+    env_steps: int,
+    seed: int = 0,
+    bots: Sequence[str] = (),
 ) -> EnvironmentReport:
     """Make one environment, play it with random actions, and close it; then the same with its vector entry point.
 
@@ -205,9 +211,10 @@ def check_environment(
       seconds: how long to play, unless `env_steps` are done before; 0 only makes the environment.
       env_steps: the most steps.
       seed: of the environment and the actions.
+      bots: opponents in a game that are code; each plays a match.
     """
     if spec.is_game:
-        return check_game(spec, modules, seconds=seconds, env_steps=env_steps, seed=seed)
+        return check_game(spec, modules, seconds=seconds, env_steps=env_steps, seed=seed, bots=bots)
     report = _check_one(spec, modules, seconds, env_steps, seed)
     if report.problems or report.spaces is None or seconds == 0.0:
         return report

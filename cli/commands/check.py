@@ -24,6 +24,7 @@ from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.protocol.league import is_bot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import short_number
@@ -90,6 +91,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
         most_seconds=seconds + _MORE_SECONDS,
         shown=True,
         notes=True,
+        bots=tuple(filter(is_bot, spec.league.opponents)) if environment.is_game else (),
     )
     chosen = report = _report(check)
     processes = ""

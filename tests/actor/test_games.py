@@ -314,6 +314,24 @@ def dark(render_mode: str) -> Duel:
     return Duel()
 
 
+class Stubborn:
+    """A bot whose action is outside the space."""
+
+    def act(self, observation: np.ndarray, action_mask: np.ndarray | None) -> int:
+        return 7
+
+
+def test_opponents_that_are_code_are_checked() -> None:
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": "free"})
+    modules = UserModules(frozenset({"test_games"}))
+    for bots, problem in (
+        (("random",), ""),
+        (("random", "test_games:Stubborn"), "opponent test_games:Stubborn, as red"),
+    ):
+        found = check_environment(spec, modules, seconds=5.0, env_steps=20, bots=bots).problems
+        assert [problem in text for text in found] == ([True] if problem else [])
+
+
 def test_a_game_is_checked() -> None:
     report = make()
     assert report.problems == ()
