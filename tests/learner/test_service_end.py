@@ -105,7 +105,7 @@ def test_actors_wait_for_a_learner_that_was_stopped_and_join_it_again(network: M
     assert count("stopped; checkpoint saved at ") == 1
     for actor in actors:
         actor.open_gate()
-    until(lambda: count("the learner was stopped; waiting for it to return") == ACTORS)
+    until(lambda: count("run 'run': the learner was stopped; waiting for it to return") == ACTORS)
     assert not any(actor.ended for actor in actors)
     resumed = LearnerProcess(network, tmp_path / "run", resume=True)
     until(lambda: count("joined run") == 2 * ACTORS)
