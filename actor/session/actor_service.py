@@ -68,7 +68,7 @@ class ActorService:
         try:
             return self._thread.run(self._session.play(), self._perform)  # until it raises
         except RunOverError as error:
-            _logger.info("run %r: %s", self._session.run, error)
+            _logger.info("%s%s", f"run {self._session.run!r}: " if self._session.run else "", error)
             return error.finished
         except Exception as error:
             self._thread.run(self._session.report_failure(error), to_the_end=True)

@@ -39,7 +39,7 @@ def test_actor_that_cannot_be_started_ends_the_learner_and_the_actors_before_it(
     def supervised(*_: Any) -> Supervised:
         return Supervised("process", begin, ended={0})
 
-    monkeypatch.setattr(local_training, "_supervised_learner", supervised)
+    monkeypatch.setattr(local_training, "supervised_learner", supervised)
     monkeypatch.setattr(local_training, "supervised_actor", supervised)
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "collection": {"actors": 4}})
     output = ChildOutput(tmp_path / "output.log", print, print)

@@ -31,7 +31,7 @@ def check(words: Sequence[str]) -> str:
         if command == "actor":
             actor.actor_options(parsed).config(None)
         if command == "router":
-            check_listening([parsed.listen], tls=parsed.tls is not None, insecure=parsed.insecure)
+            check_listening(parsed.listen, tls=parsed.tls is not None, insecure=parsed.insecure)
     except (SystemExit, SettingsError, AddressError, ValueError) as error:
         pytest.fail(f"`daedalus {' '.join(words)}` is invalid: {error}")
     return command

@@ -250,7 +250,7 @@ def test_drained_actor_leaves_after_its_rollout_and_the_others_play_on(network: 
     assert "no actor 'other' takes part" in unknown.reason
     leaving.open_gate()
     assert leaving.join() is False
-    assert count("drained by operator alice at laptop: this actor leaves the run") == 1
+    assert count("run 'run': drained by operator alice at laptop: this actor leaves the run") == 1
     staying.collector.waiting.clear()
     staying.open_gate()
     for _ in range(2):
