@@ -43,7 +43,7 @@ def test_drained_actor_ends(network: MemoryNetwork, actor: RunningActor) -> None
     acknowledge(request, "drained")
     actor.join()
     assert actor.error is None
-    assert LINES[-1] == "drained by an operator: this actor leaves the run"
+    assert LINES[-1] == "run 'r': drained by an operator: this actor leaves the run"
 
 
 @pytest.mark.parametrize("how", ["run_ended", "finished"])
@@ -60,7 +60,7 @@ def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningA
         acknowledge(request, "finished")
     actor.join()
     assert actor.error is None
-    assert LINES[-1].startswith("the run is over")
+    assert LINES[-1].startswith("run 'r': the run is over")
 
 
 def test_damaged_message_is_logged_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
