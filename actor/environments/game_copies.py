@@ -9,6 +9,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.protocol.spec import EnvironmentSpec
 
+_MOST_EMPTY_MATCHES = 100  # in a row, in which no agent with a seat has a part
 _MOST_IDLE_TURNS = 100_000  # of agents without a seat, between two turns of the seats
 
 OtherAction = Callable[[str, Any, Any], Any]  # of an agent without a seat, for its observation and info
@@ -92,9 +93,13 @@ class _TurnGame:
 
     def reset(self, seed: int | None) -> list[Outcome]:
         """See GameCopy."""
-        self._environment.reset(seed=seed)
-        self._turn = None
-        return _some(self._advance())
+        for _ in range(_MOST_EMPTY_MATCHES):
+            self._environment.reset(seed=seed)
+            self._turn = None
+            if outcomes := self._advance():
+                return outcomes
+            seed = None  # no agent with a seat had a part in the match: the next one
+        raise _none()
 
     @property
     def turns(self) -> Sequence[str]:
@@ -133,11 +138,8 @@ class _TurnGame:
         raise _idle()
 
 
-def _some(outcomes: list[Outcome]) -> list[Outcome]:
-    """Return what is new after a reset. Raises EnvironmentSetupError if there is nothing."""
-    if not outcomes:
-        raise EnvironmentSetupError("no agent can act after reset")
-    return outcomes
+def _none() -> EnvironmentSetupError:
+    return EnvironmentSetupError(f"no agent can act after reset, in {_MOST_EMPTY_MATCHES} matches one after the other")
 
 
 def _idle() -> EnvironmentSetupError:
@@ -153,9 +155,13 @@ class _SimultaneousGame:
 
     def reset(self, seed: int | None) -> list[Outcome]:
         """See GameCopy."""
-        observations, infos = self._environment.reset(seed=seed)
-        outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos)
-        return _some(outcomes or self.step({}))
+        for _ in range(_MOST_EMPTY_MATCHES):
+            observations, infos = self._environment.reset(seed=seed)
+            outcomes = self._outcomes(self._environment.agents, observations, {}, {}, {}, infos) or self.step({})
+            if outcomes:
+                return outcomes
+            seed = None  # no agent with a seat had a part in the match: the next one
+        raise _none()
 
     @property
     def turns(self) -> Sequence[str]:
