@@ -20,9 +20,9 @@ from daedalus.gateway.security import LOOPBACK, OperatorToken, Tokens, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.watching.camera import CameraProcess
 from daedalus.gateway.watching.learner_source import LearnerSource
-from daedalus.gateway.watching.matches import Matches
 from daedalus.gateway.watching.monitor import RunMonitor
 from daedalus.gateway.watching.page_data import Observation, OtherRun, PageData, ReadFolder
+from daedalus.gateway.watching.person_matches import Matches
 from daedalus.gateway.watching.playing_process import PolicySource
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import Order

@@ -1,7 +1,7 @@
 """The process of a match on the gateway's page: one person plays against the policy that the gateway sends.
 
-It has no network: see gateway/watching/playing_process.py for its messages, and gateway/watching/matches.py for the
-orders. It runs at the lowest priority. Exit status: 0 the gateway has closed its input or stopped it, 1 failed.
+It has no network: see gateway/watching/playing_process.py for its messages, and gateway/watching/person_matches.py for
+the orders. It runs at the lowest priority. Exit status: 0 the gateway has closed its input or stopped it, 1 failed.
 """
 
 import argparse

@@ -75,6 +75,14 @@ def rating_copies(league: LeagueSpec, agents: Sequence[str]) -> int:
     return 1 if league.rating_share > 0.0 and len(sides_of(league, agents)) > 1 else 0
 
 
+def _shares_without_opponents(league: LeagueSpec) -> str:
+    """Return the name of a setting that asks for opponents, or an empty string."""
+    for name in ("past_share", "target_opponent", "target_rating"):
+        if getattr(league, name):
+            return name
+    return "opponents" if any(league.opponents.values()) else ""
+
+
 class _OpponentPolicy:
     """The policy of an opponent, with its memory of each seat."""
 
@@ -118,7 +126,20 @@ class Lineup:
         if len(self._sides) > 1:
             past = DEFAULT_PAST_SHARE if league.past_share is None else league.past_share
             share = past + sum(league.opponents.values())
+        elif unused := _shares_without_opponents(league):
+            raise EnvironmentSetupError(
+                f"league.{unused} is set, but the agents of {games.name} ({', '.join(games.agents[:6])}) are one side "
+                "and have no opponent: name the sides in league.sides, or leave it out"
+            )
         with_opponents = round(share * copies)
+        if share > 0.0 and not with_opponents:
+            _logger.warning(
+                "no match is played against opponents, for %g of %d copies of the game is less than half a copy: set "
+                "collection.envs_per_actor (--envs of an actor) to %d or more, or league.past_share to 0",
+                share,
+                copies,
+                math.floor(0.5 / share) + 1,
+            )
         self._alone = copies - with_opponents  # copies with the newest policy in all seats
         self.columns = self._alone * self._seats + with_opponents * len(self._sides[0])
         self.is_newest, self.is_greedy = np.ones(games.count, np.bool_), np.zeros(games.count, np.bool_)

@@ -320,7 +320,7 @@ class SeatWriter(RolloutWriter):
         }
         self._over = np.ones(total // seats, np.bool_)  # of each copy: whether its next step is a reset
         self._env_steps = self._skipped = 0  # of this rollout; rows that were not written
-        self._warned = False
+        self._warned = self._warned_of_steps = False
 
     def start(self, observed: Observed) -> None:
         """See RolloutWriter."""
@@ -446,6 +446,14 @@ class SeatWriter(RolloutWriter):
                 "others: each has as many rows in a rollout (environment.agents chooses the agents)"
             )
         most = rollout.agent_steps * self._lineup.sides  # the learner takes no more
+        if self._env_steps > most and not self._warned_of_steps:
+            self._warned_of_steps = True
+            _logger.warning(
+                "opponents act much more often than the policy: of %d env_steps only %d are counted for a rollout, its "
+                "rows times the number of sides",
+                self._env_steps,
+                most,
+            )
         rollout = replace(rollout, game_steps=min(self._env_steps, most), matches=self._lineup.take_matches())
         self._rows[:] = 0
         self._env_steps = self._skipped = 0

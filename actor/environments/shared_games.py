@@ -1,8 +1,8 @@
 """Copies of one game whose seats belong to several runs, and the view that each run has of them.
 
-Each run's seats are a GameEnvironments of its own, on its own thread. A copy of the game goes on as soon as every run
-that was shown something has answered: nobody waits for a run whose agents have nothing to do. Whoever answers last
-plays on with all actions.
+Each run's seats are a GameEnvironments of its own, on its own thread. A copy of the game is stepped as soon as all runs
+whose agents have a new observation have sent their actions; it does not wait for the others. The thread of the run that
+sends its actions last makes the step.
 """
 
 import threading

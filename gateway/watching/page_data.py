@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from daedalus.gateway.places import Places
-from daedalus.gateway.watching.matches import Matches
+from daedalus.gateway.watching.person_matches import Matches
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import ActorStatus, Event, EventsPage, MetricsReport, Order, RunStatus
 

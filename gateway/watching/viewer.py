@@ -11,8 +11,8 @@ from daedalus.gateway.channel import channel_of
 from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.security import OPERATOR, Guard, RateLimit
 from daedalus.gateway.watching import page_data
-from daedalus.gateway.watching.matches import BeginMatch, Matches, MatchOrder, PlayMove, new_orders
 from daedalus.gateway.watching.page_data import Observation, PageData
+from daedalus.gateway.watching.person_matches import BeginMatch, Matches, MatchOrder, PlayMove, new_orders
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import Order
 

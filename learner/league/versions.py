@@ -1,5 +1,6 @@
-"""Kept versions of the policy on the disk: one sealed directory each, in the folder `league` of the run."""
+"""The folder `league` of a run: kept versions of its policy, and policies of other runs, one sealed directory each."""
 
+import hashlib
 import logging
 import re
 import shutil
@@ -11,7 +12,18 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from daedalus.policy.saving.saved_policy import FORMAT, PARAMETERS_FILE, POLICY_LIMITS
+from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.saving.hub import HubError, pull
+from daedalus.policy.saving.saved_policy import (
+    FORMAT,
+    PARAMETERS_FILE,
+    POLICY_LIMITS,
+    NoPolicyError,
+    SavedPolicy,
+    export_policy,
+    find_policy,
+    read_policy,
+)
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, is_unfinished, remove_sealed, write_sealed
 
 _logger = logging.getLogger(__name__)
@@ -96,3 +108,32 @@ def _env_steps(directory: Path, sealed: SealedDirectory) -> int:
     if sealed.content.get("format") != FORMAT or not isinstance(env_steps, int) or not 0 <= env_steps < 2**63:
         raise DamagedError(f"{directory}: written by another release")
     return env_steps
+
+
+def opponent_run(name: str, folder: Path) -> SavedPolicy:
+    """Return the policy of another run that is an opponent; the first call copies it into this run.
+
+    The copy stays the opponent: the other run may go on, and a rating belongs to one policy.
+
+    Args:
+      name: a run directory, one of its checkpoints, or USER/NAME on the Hub.
+      folder: has the copies of this run, or will have them.
+
+    Raises SettingsError, which names the opponent.
+    """
+    copy = folder / f"opponent_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    try:
+        if copy.exists():
+            return read_policy(copy)
+        source, (owner, _, rest) = Path(name), name.partition("/")
+        if not source.exists() and rest and "/" not in rest and owner not in (".", "..", "~", ""):
+            source = pull(name)
+        policy = find_policy(source)
+        export_policy(policy.directory, copy)
+    except (HubError, NoPolicyError, DamagedError) as error:
+        again = f"; remove {copy} to read {name} again" if copy.exists() else ""
+        raise SettingsError(f"league.opponents: {name} cannot be loaded: {error}{again}") from None
+    except OSError as error:
+        raise SettingsError(f"league.opponents: {name} cannot be copied to {copy}: {error.strerror or error}") from None
+    _logger.info("opponent %s: policy version %d of %s", name, policy.policy_version, policy.directory)
+    return policy

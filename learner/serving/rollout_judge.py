@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from daedalus.learner.league.league import League
+from daedalus.learner.league.run_league import League
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.upload_checks import (
     Shapes,

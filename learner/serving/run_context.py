@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from daedalus.learner.league.league import League
 from daedalus.learner.league.ratings import LeagueState
+from daedalus.learner.league.run_league import League
 from daedalus.learner.reporting.thinning import MetricsHistory
 from daedalus.learner.run.counters import Annealing, RunCounters
 from daedalus.learner.run.run_directory import run_name

@@ -67,7 +67,8 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
     side = agents // 2 if agents in (2, 4) else agents
     names = [f"agent_{number}" for number in range(agents)]
     sides = (tuple(names[:side]), tuple(names[side:])) if side < agents else ()
-    league = LeagueSpec(past_share=0.0, opponents={"random": share}, rating_share=0.2, sides=sides)
+    opponents = {"random": share if sides else 0.0}
+    league = LeagueSpec(past_share=0.0, opponents=opponents, rating_share=0.2, sides=sides)
     collector = started_collector(spec, Counting(), count=copies, rollout_length=length, league=league)
     alone = copies - (round(share * copies) if sides else 0)  # the others play against an opponent
     accounts: dict[int, dict] = {}
@@ -240,6 +241,36 @@ def test_games_are_the_same_without_pettingzoo_s_checks(fields: dict[str, Any]) 
     for one, other in zip(*tapes, strict=True):
         for values, same in zip(one, other, strict=True):
             np.testing.assert_array_equal(values, same)
+
+
+@pytest.mark.parametrize(
+    ("league", "text"),
+    [
+        (
+            {"sides": [["red", "blue"]], "past_share": 0.5},
+            r"league\.past_share is set, but .* \(red, blue\) are one side",
+        ),
+        ({"sides": [["red", "blue"]], "opponents": {"random": 0.1}}, r"league\.opponents is set, but"),
+        ({"sides": [["red"]]}, "must name each agent of the policy once"),
+        ({"sides": [["red", "blue"], ["red"]]}, "must name each agent of the policy once"),
+    ],
+)
+def test_opponents_that_a_game_cannot_have_are_refused(league: dict[str, Any], text: str) -> None:
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": "free"})
+    modules = UserModules(frozenset({"test_games"}))
+    with pytest.raises(EnvironmentSetupError, match=text):
+        started_collector(spec, Always(1), rollout_length=5, league=LeagueSpec.model_validate(league), modules=modules)
+
+
+def test_too_few_copies_for_the_opponents_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": "free"})
+    for copies in (2, 3):
+        modules = UserModules(frozenset({"test_games"}))
+        started_collector(spec, Always(1), count=copies, rollout_length=5, modules=modules).close()
+        said = [record.message for record in caplog.records if "no match is played against opponents" in record.message]
+        assert len(said) == 1
+        assert "0.2 of 2 copies" in said[0]
+        assert "to 3 or more" in said[0]
 
 
 def test_a_match_that_only_rates_and_does_not_end_is_abandoned(caplog: pytest.LogCaptureFixture) -> None:

@@ -17,8 +17,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from daedalus.actor.evaluation.person_match import PersonMatch
 from daedalus.gateway.learner_link import NewestPolicy
-from daedalus.gateway.watching import matches as matches_module
-from daedalus.gateway.watching.matches import Matches
+from daedalus.gateway.watching import person_matches as matches_module
+from daedalus.gateway.watching.person_matches import Matches
 from daedalus.gateway.watching.playing_process import PolicySource
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.user_modules import NO_MODULES

@@ -17,8 +17,8 @@ from processes import LIMIT, until
 from saved_runs import save
 from test_learner_service import TrainingRun
 
-from daedalus.learner.league.league import League
 from daedalus.learner.league.ratings import LeagueState
+from daedalus.learner.league.run_league import League
 from daedalus.learner.run.resuming import finished_run
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.rollout_intake import RolloutIntake

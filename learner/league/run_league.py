@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daedalus.learner.league.opponent_runs import opponent_run
 from daedalus.learner.league.ratings import LeagueState, Ratings
-from daedalus.learner.league.versions import KeptVersion, VersionFolder, encoded, thinned
+from daedalus.learner.league.versions import KeptVersion, VersionFolder, encoded, opponent_run, thinned
 from daedalus.learner.run.resuming import other_spaces
 from daedalus.learner.run.run_directory import LEAGUE
 from daedalus.learner.run.settings import SettingsError
