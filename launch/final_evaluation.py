@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from daedalus.launch.process_lifecycle import (
     exit_with_parent,
     stop_on_signals,
 )
+from daedalus.learner.league.versions import opponent_copy
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
@@ -191,9 +192,12 @@ class FinalEpisodes:
         games = max(spec.evaluation.final_episodes // sides, 1) * sides
         results = []
         for name in opponents:
-            options = EvaluationOptions(directory=directory, against=name, episodes=games, allowed_modules=modules)
+            copy = opponent_copy(name, directory / run_directory.LEAGUE)  # the policy that training has met
+            against = str(copy) if copy.exists() else name
+            options = EvaluationOptions(directory=directory, against=against, episodes=games, allowed_modules=modules)
             seed = spec.training.seed + _FINAL_SEEDS
-            results.append(evaluated_matches(policy, options, seed, self._stop, io.StringIO()))
+            result = evaluated_matches(policy, options, seed, self._stop, io.StringIO())
+            results.append({**result, "matches": replace(result["matches"], opponent=name)})
         evaluation = {**results[0], "matches": asdict(results[0]["matches"])}
         evaluation["notes"] += [match_note(result["matches"]) for result in results[1:]]
         summary = run_directory.read_json(directory / run_directory.SUMMARY)

@@ -90,6 +90,7 @@ class RoleTraining:
         self._learning = {role.role: role for role in roles}
         self._learners: dict[str, Supervised] = {}  # of those that learn, by role
         self._players: list[Supervised] = []  # actors and evaluators
+        self._evaluators: dict[str, Supervised] = {}  # of those that learn, by role
         self._routers: list[Supervised] = []
         self._trackers: list[TrackerProcesses] = []
         self._actor_options: list[str] = []  # a restarted actor has those of the moment
@@ -132,7 +133,9 @@ class RoleTraining:
         for role in self._roles:
             if role.run.spec.evaluation.seconds is not None:
                 options, output = (*actor_arguments(role.run), "--evaluator", "--run", role.name), role.output
-                self._players.append(supervised_actor(_EVALUATOR, address, options, output.pipes, output.last_error))
+                evaluator = supervised_actor(_EVALUATOR, address, options, output.pipes, output.last_error)
+                self._evaluators[role.role] = evaluator
+                self._players.append(evaluator)
             trackers = TrackerProcesses(role.run.log, role.run.directory, role.output, log_json=role.run.logs.as_json)
             self._trackers.append(trackers)
             trackers.start()
@@ -187,20 +190,25 @@ class RoleTraining:
             for router in self._routers:
                 note(router.check())
             for player in list(self._players):
+                owners = [name for name, evaluator in self._evaluators.items() if evaluator is player]
                 try:
-                    note(player.check())
+                    note(player.check(), *owners)
                 except FailedError as error:
                     self._players.remove(player)
                     stop([player.process])
                     if all(each.name == _EVALUATOR for each in self._players):
                         raise FailedError("all actors", error.reason, "failed") from None
-                    note(f"{error}; training continues without this process")
+                    note(f"{error}; training continues without this process", *owners)
         raise RunStoppedError
 
     def _end(self, role: RoleRun) -> None:
         """Note that the run of a role is over: its last policy plays on while others learn."""
         del self._learning[role.role]
         self._over.append(role)
+        evaluator = self._evaluators.pop(role.role, None)
+        if evaluator is not None:
+            stop([evaluator.process])
+            self._players = [player for player in self._players if player is not evaluator]
         if self._learning:
             self._choose_seats()
             _logger.info(

@@ -15,7 +15,6 @@ from daedalus.protocol.models import NaturalInt, Specification
 
 NEWEST = "newest"  # the policy that learns, at whatever version an actor has it
 RANDOM = "random"  # legal actions, all equally probable
-DEFAULT_PAST_SHARE = 0.2  # of the matches of a game with opponents, against past versions
 MAX_PLAYER = 200  # characters
 MAX_SIDES = 1024
 _MAX_PLAYERS = 512

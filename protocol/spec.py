@@ -34,6 +34,7 @@ _Part = TypeVar("_Part", bound=Specification)
 _MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcome, and the names of the settings
 
 
+_PAST_SHARE = 0.2  # of the matches, if it is not set
 FROM_PYTHON = "python:"  # beginning of the id of an environment that only the program has which started the run
 
 
@@ -427,7 +428,7 @@ class LeagueSpec(Specification):
     ] = ()
     """Agents that play together, for each side. Unset: each agent alone if there are two, else all on one side."""
     past_share: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
-    """Share of the matches against past versions. Unset: 0.2, or 0 in a game with one side."""
+    """Share of the matches against past versions. Unset: 0.2, or what `opponents` leave."""
     opponents: Annotated[
         dict[Annotated[str, Field(min_length=1, max_length=200)], Annotated[float, Field(ge=0.0, le=1.0)]],
         Field(max_length=64),
@@ -463,6 +464,13 @@ class LeagueSpec(Specification):
             if self.target_rating is not None:
                 raise ValueError("league.target_opponent and league.target_rating are both set: unset one of them")
         return self
+
+    @property
+    def past(self) -> float:
+        """Share of the matches against past versions in a game with more than one side."""
+        if self.past_share is not None:
+            return self.past_share
+        return max(min(_PAST_SHARE, 1.0 - sum(self.opponents.values())), 0.0)
 
     @property
     def user_modules(self) -> dict[str, str]:
@@ -604,7 +612,7 @@ class RunSpec(Specification):
             raise ValueError(
                 f"{changed[0]} is for games with several agents (environment.backend=pettingzoo): leave it unset"
             )
-        if (self.league.past_share or 0.0) + sum(self.league.opponents.values()) > 1.0:
+        if self.league.past + sum(self.league.opponents.values()) > 1.0 + 1e-9:
             raise ValueError("league.past_share and the shares of league.opponents are more than 1 together")
         for name in ("target_opponent", "target_rating"):
             if getattr(self.league, name) is not None and self.training.target_return is not None:

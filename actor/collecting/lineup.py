@@ -18,7 +18,6 @@ from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_n
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.league import (
-    DEFAULT_PAST_SHARE,
     NEWEST,
     MatchCount,
     Matches,
@@ -124,14 +123,13 @@ class Lineup:
         self._seats, self._copies, self._learned = games.seats, games.count // games.seats, copies
         share = 0.0
         if len(self._sides) > 1:
-            past = DEFAULT_PAST_SHARE if league.past_share is None else league.past_share
-            share = past + sum(league.opponents.values())
+            share = league.past + sum(league.opponents.values())
         elif unused := _shares_without_opponents(league):
             raise EnvironmentSetupError(
                 f"league.{unused} is set, but the agents of {games.name} ({', '.join(games.agents[:6])}) are one side "
                 "and have no opponent: name the sides in league.sides, or leave it out"
             )
-        with_opponents = round(share * copies)
+        with_opponents = min(round(share * copies), copies)
         if share > 0.0 and not with_opponents:
             _logger.warning(
                 "no match is played against opponents, for %g of %d copies of the game is less than half a copy: set "

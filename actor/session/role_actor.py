@@ -5,6 +5,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -69,6 +70,7 @@ class RoleCollector(EnvironmentCollector):
         self._spec: ActorSpec | None = None
         self._beginning: Callable[[], None] | None = None  # waits for the other runs: left to the first `collect`
         self._has_begun = False
+        self._epsilon = 0.0
         self._snapshot: Snapshot | None = None
         self.on_wait: Callable[[], object] = lambda: None
 
@@ -101,11 +103,13 @@ class RoleCollector(EnvironmentCollector):
         """See Collector. A learner that has returned finds the matches under way, with the memory of its seats."""
         if not self._has_begun:
             self._beginning = partial(super().begin, runtime, spec, seed, epsilon)
+            self._epsilon = epsilon
             return
         before = self._runtime
         assert before is not None
         assert self._writer is not None
-        if (before.state_size, before.noise_size) != (runtime.state_size, runtime.noise_size):
+        fixed = before.state_size, before.noise_size, self._epsilon
+        if fixed != (runtime.state_size, runtime.noise_size, epsilon):
             raise self._changed()
         self._runtime = runtime
         self._writer.use(runtime)
@@ -230,8 +234,8 @@ class RoleActor:
                 stopped = self._stop.wait(_POLL_SECONDS)
                 failed = any(role.error is not None for role in self._roles)
                 if stopped or failed:
-                    self._ends.set()
-                elif not left and any(role.left for role in self._roles):
+                    break
+                if not left and any(role.left for role in self._roles):
                     left = True
                     self.leave(time.monotonic() + _LEAVE_SECONDS)
         finally:
@@ -239,10 +243,11 @@ class RoleActor:
             for role in self._roles:
                 if role.thread.ident is not None:
                     role.thread.join()
-            self._games.close()
-        for role in self._roles:
-            if role.error is not None:
-                raise role.error
+            errors = [role.error for role in self._roles if role.error is not None]
+            with suppress(*([EnvironmentSetupError] if errors else [])):  # of games that failed already
+                self._games.close()
+        if errors:
+            raise errors[0]
         return all(role.finished for role in self._learning)
 
     def leave(self, by: float) -> None:

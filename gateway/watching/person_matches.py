@@ -95,6 +95,7 @@ class _Person:
         self._order: MatchOrder | None = None  # that no process has received
         self._is_answered = True  # whether a frame has come since the last order
         self._is_idle = False
+        self._waits_for_other = False  # whether the order is for another process, with the policy of another session
 
     async def run(self) -> None:
         """Serve the person until no order comes any more."""
@@ -102,8 +103,12 @@ class _Person:
             policy = self._policies.newest()
             if policy is None:
                 self._show(note("There is no policy yet: the match begins as soon as there is one."))
-                while self._policies.newest() is None:
-                    await asyncio.sleep(_POLL_SECONDS)
+                try:
+                    async with asyncio.timeout(_IDLE_SECONDS):
+                        while self._policies.newest() is None:
+                            await asyncio.sleep(_POLL_SECONDS)
+                except TimeoutError:
+                    self._refuse("There is still no policy: begin the match again later.")
             elif not policy.session.spec.environment.is_game:
                 name = policy.session.spec.environment.id
                 self._refuse(f"The run plays {name}, which is no game with several agents.")
@@ -118,13 +123,14 @@ class _Person:
         self._show(note(reason))
 
     async def _serve(self, policy: NewestPolicy) -> None:
+        self._waits_for_other = False
         try:
             await run_process(self._command, partial(self._feed, policy), self._answer)
         except OSError as error:
             self._refuse(f"The match cannot be started: {error.strerror}")
             return
-        if self._order is None and not self._is_answered:
-            self._show(note("The process of the match has ended: begin another match."))
+        if not (self._is_answered if self._order is None else self._waits_for_other or self._is_idle):
+            self._refuse("The process of the match has ended: begin another match.")
 
     def _answer(self, frame: bytes) -> None:
         self._is_answered = True
@@ -148,6 +154,7 @@ class _Person:
             newest = self._policies.newest()
             if isinstance(order, BeginMatch) and newest is not None and newest is not held:
                 if newest.session is not held.session:
+                    self._waits_for_other = True
                     return
                 held = newest
                 await send(writer, encode(held.snapshot))

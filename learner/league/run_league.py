@@ -29,7 +29,7 @@ from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.saving.sealed import DamagedError, UnreadableError
 from daedalus.protocol.codec import encode
-from daedalus.protocol.league import DEFAULT_PAST_SHARE, LeagueStatus, Matches, Plan, is_bot, version_name, version_of
+from daedalus.protocol.league import LeagueStatus, Matches, Plan, is_bot, version_name, version_of
 from daedalus.protocol.messages import LeaguePlan, Program, Refusal, Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -215,9 +215,8 @@ class League:
         """Renew the plan. Needs the lock."""
         assert self._ratings is not None
         settings = self._spec.league
-        past = DEFAULT_PAST_SHARE if settings.past_share is None else settings.past_share
         self._plan_at, self._changed = time.monotonic() + _PLAN_SECONDS, False
-        training = self._ratings.training_plan(past, self._fixed, prioritized=settings.choice == "prioritized")
+        training = self._ratings.training_plan(settings.past, self._fixed, prioritized=settings.choice == "prioritized")
         rating = self._ratings.rating_plan(self._fixed) if settings.rating_share else ()
         if self._encoded_plan and (training, rating) == (self._plan.training, self._plan.rating):
             return

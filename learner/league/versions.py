@@ -110,6 +110,11 @@ def _env_steps(directory: Path, sealed: SealedDirectory) -> int:
     return env_steps
 
 
+def opponent_copy(name: str, folder: Path) -> Path:
+    """Return where the copy of the policy of another run is, or will be."""
+    return folder / f"opponent_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+
+
 def opponent_run(name: str, folder: Path) -> SavedPolicy:
     """Return the policy of another run that is an opponent; the first call copies it into this run.
 
@@ -121,7 +126,7 @@ def opponent_run(name: str, folder: Path) -> SavedPolicy:
 
     Raises SettingsError, which names the opponent.
     """
-    copy = folder / f"opponent_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    copy = opponent_copy(name, folder)
     try:
         if copy.exists():
             return read_policy(copy)

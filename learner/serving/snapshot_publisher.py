@@ -309,6 +309,10 @@ class SnapshotPublisher:
         """Return the answer to a request for whom to play."""
         if self._league is None:
             return _refusal("unknown", "the run plays no game with several agents")
+        with self._context.lock:
+            has_joined = request.actor in self._context.fleet.actors
+        if not has_joined:  # the first request of an actor begins the league
+            return _refusal("not_ready", "join the run first")
         return self.snapshot() if self._ended else self._league.plan(request.held_revision)
 
     def _of_player(self, player: str) -> bytes:

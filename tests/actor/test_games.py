@@ -262,6 +262,17 @@ def test_opponents_that_a_game_cannot_have_are_refused(league: dict[str, Any], t
         started_collector(spec, Always(1), rollout_length=5, league=LeagueSpec.model_validate(league), modules=modules)
 
 
+@pytest.mark.parametrize(("share", "columns"), [(1.0, 10), (0.9, 10), (0.5, 13)])
+def test_past_versions_have_what_the_opponents_leave(share: float, columns: int) -> None:
+    spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": "free"})
+    league, modules = LeagueSpec(opponents={"random": share}), UserModules(frozenset({"test_games"}))
+    collector = started_collector(spec, Always(1), count=10, rollout_length=5, league=league, modules=modules)
+    rollout = collect(collector)
+    collector.close()
+    assert rollout.environments == columns  # 2 of a copy without opponents, 1 of the others
+    assert rollout.agent_steps == 5 * columns
+
+
 def test_too_few_copies_for_the_opponents_are_said(caplog: pytest.LogCaptureFixture) -> None:
     spec = EnvironmentSpec(id="test_games:Duel", backend="pettingzoo", kwargs={"problem": "free"})
     for copies in (2, 3):

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -147,6 +148,17 @@ BAD = [
     {"type": "move", "turn": 0, "action": {"action": [[1]]}},
     {"type": "move", "turn": 0, "action": {"action": [1]}},  # without a match
 ]
+
+
+def test_a_process_that_ends_at_once_is_not_started_again_and_again(scene: Scene, tmp_path: Path) -> None:
+    starts = tmp_path / "starts"
+    command = [sys.executable, "-c", f"open({str(starts)!r}, 'a').write('x')"]
+    scene.matches = scene.gateway.data.matches = Matches(command, PolicySource(lambda: scene.policy))
+    scene.policy = policy_of("pettingzoo.classic.connect_four_v3")
+    person = scene.person()
+    for number in (1, 2):
+        assert "The process of the match has ended" in person.begin()["error"]
+        assert starts.read_text() == "x" * number
 
 
 def test_orders_that_are_malformed_or_too_early_start_nothing(scene: Scene) -> None:

@@ -189,7 +189,10 @@ def test_another_run_is_an_opponent_with_a_program_of_its_own_which_stays(tmp_pa
 
 
 @pytest.mark.parametrize("name", ["nowhere/at/all", "runs"])
-def test_an_opponent_that_cannot_be_loaded_is_named_in_one_line(tmp_path: Path, name: str) -> None:
+def test_an_opponent_that_cannot_be_loaded_is_named_in_one_line(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where there are no runs
     with pytest.raises(
         SettingsError, match=rf"^league\.opponents: {name} cannot be loaded: {name} does not exist"
     ) as caught:
@@ -312,8 +315,15 @@ def test_an_actor_gets_plans_and_versions_and_the_ratings_are_in_the_status(tmp_
             return league is not None and sum(each.matches > 0 for each in league.players) > 3
 
         until(has_results)
-        request = encode(LeagueRequest(actor="reader"))
-        plan = decode(reader.query(keys.snapshots("run"), request, timeout=LIMIT)[0], Limits())
+
+        def plan_for(actor: str) -> object:
+            request = encode(LeagueRequest(actor=actor))
+            return decode(reader.query(keys.snapshots("run"), request, timeout=LIMIT)[0], Limits())
+
+        assert isinstance(plan_for("stranger"), Refusal)  # who has not joined begins no league
+        report = decode(reader.query(keys.status("run"), timeout=LIMIT)[0], Limits())
+        assert isinstance(report, StatusReport)
+        plan = plan_for(report.status.actors[0].actor)
         assert isinstance(plan, LeaguePlan)
         assert plan.plan.training[0].player == "v0"
         wanted = encode(LeagueRequest(actor="reader", player="v0"))
