@@ -59,11 +59,19 @@ def fork(work: Callable[[], int], standard: tuple[int, int, int], keep: Set[int]
     """
     sys.stdout.flush()
     sys.stderr.flush()
-    with interrupts_held(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # Python's, about threads of this process
-        pid = os.fork()
-        if not pid:
-            _run_child(work, standard, keep)
+    pid = 0
+    try:
+        # os.fork calls functions of modules, and Python drops what a handler of a signal raises in them.
+        with interrupts_held(signal.SIGTERM), warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # Python's, about threads of this process
+            pid = os.fork()
+            if not pid:
+                _run_child(work, standard, keep)
+    except BaseException:  # a signal that waited
+        if pid:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+        raise
     return pid
 
 
@@ -99,6 +107,7 @@ def _take_over(standard: tuple[int, int, int], keep: Set[int]) -> None:
     signal.set_wakeup_fd(-1)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     _new_randomness()
 
 

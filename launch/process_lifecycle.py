@@ -68,16 +68,16 @@ def raise_descriptor_limit() -> None:
 
 
 @contextlib.contextmanager
-def interrupts_held() -> Iterator[None]:
+def interrupts_held(*others: signal.Signals) -> Iterator[None]:
     """Block SIGINT in this thread, and in the child processes that are started in the block until `stop_on_signals`.
 
     A child process needs seconds to import its modules. Ctrl-C would end it there with a traceback; a blocked signal
-    waits for the handlers.
+    waits for the handlers. `others` are blocked too.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, *others})
     try:
         yield
     finally:
