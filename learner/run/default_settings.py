@@ -3,7 +3,8 @@
 import importlib.resources
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal
 
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
@@ -18,15 +19,21 @@ _FULL_SEATS = 2  # of a game: if there are more, an actor plays fewer copies, fo
 _FULL_NOISE = 2  # numbers of an action: if there are more, each is explored less
 
 
-def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = (), seats: int = 1) -> dict[str, Any]:
+def default_settings(
+    spaces: Spaces | None,
+    leave_out: Sequence[str] = (),
+    seats: int = 1,
+    symbols: Mapping[str, tuple[int, ...]] = MappingProxyType({}),
+) -> dict[str, Any]:
     """Return the default settings for the spaces of an environment, as a preset has them.
 
     Args:
       spaces: of the environment without transforms; None if they are not known.
       leave_out: components of the observation that are not in `spaces`.
       seats: agents of a game that the policy plays: each has rows of its own.
+      symbols: small maps among the observations, with the number of codes of each channel; none for planes.
     """
-    kind = _UNKNOWN if spaces is None else kind_of(spaces)
+    kind = _UNKNOWN if spaces is None else kind_of(spaces, symbols)
     file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
     settings = tomllib.loads(file.read_text("utf-8"))
     if kind == "large_images" and spaces is not None and any(space.image_shape[0] != _RGB for space in _images(spaces)):
@@ -44,9 +51,21 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = (), seats
         for collection in (settings["collection"], settings["with_memory"]["collection"]):
             collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)
     if spaces is not None:
+        settings["policy"] |= _symbol_settings(spaces, symbols)
         _fit_rollouts(settings, spaces, seats)
     if leave_out:
         settings.setdefault("environment", {})["leave_out"] = list(leave_out)
+    return settings
+
+
+def _symbol_settings(spaces: Spaces, symbols: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Return the settings of the policy for small maps: codes become one-hot, and maps alone are convolved."""
+    arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
+    settings: dict[str, Any] = {}
+    if codes := {name: list(each) for name, each in symbols.items() if each}:
+        settings["codes"] = codes
+    if symbols and all(name in symbols for name, space in arrays.items() if len(space.shape) > 1):
+        settings["encoder"] = "grid"
     return settings
 
 
@@ -76,9 +95,12 @@ def _fit_rollouts(settings: dict[str, Any], spaces: Spaces, seats: int) -> None:
         each["collection"]["rollout_length"] = min(each["collection"]["rollout_length"], shortest)
 
 
-def kind_of(spaces: Spaces) -> Kind:
-    """Return the kind of spaces: with an image, else with continuous actions, else with discrete ones only."""
-    images = _images(spaces)
+def kind_of(spaces: Spaces, symbols: Collection[str] = ()) -> Kind:
+    """Return the kind of spaces: with an image, else with continuous actions, else with discrete ones only.
+
+    A map of `symbols` is no image.
+    """
+    images = _images(spaces, symbols)
     if images:
         return "large_images" if any(max(space.image_shape[1:]) > _LARGE for space in images) else "images"
     return "vectors_continuous" if _has_continuous(spaces) else "vectors_discrete"
@@ -97,5 +119,6 @@ def _noise_scale(spaces: Spaces) -> float:
     return min(1.0, math.sqrt(_FULL_NOISE / numbers))
 
 
-def _images(spaces: Spaces) -> list[ArraySpace]:
-    return [space for space in spaces.observations.values() if isinstance(space, ArraySpace) and space.is_image]
+def _images(spaces: Spaces, symbols: Collection[str] = ()) -> list[ArraySpace]:
+    observed = [space for name, space in spaces.observations.items() if name not in symbols]
+    return [space for space in observed if isinstance(space, ArraySpace) and space.is_image]

@@ -7,8 +7,8 @@ import pytest
 from daedalus.learner.run.default_settings import default_settings, kind_of
 from daedalus.learner.run.settings import choose_algorithm, run_spec
 from daedalus.policy.acting.program import export_program
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
-from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.compact import bfloat16, float32
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
