@@ -1,4 +1,4 @@
-"""Default settings of an environment without a preset, chosen by its spaces and seats and by nothing else about it."""
+"""Default settings of an environment without a preset, chosen by its observations, actions and seats."""
 
 import importlib.resources
 import math
@@ -59,12 +59,16 @@ def default_settings(
 
 
 def _symbol_settings(spaces: Spaces, symbols: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Return the settings of the policy for small maps: codes become one-hot, and maps alone are convolved."""
+    """Return the settings of the policy for small maps: codes become one-hot, and planes are convolved.
+
+    Planes are not convolved beside another array of several axes, whose encoder could be another.
+    """
     arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
     settings: dict[str, Any] = {}
     if codes := {name: list(each) for name, each in symbols.items() if each}:
         settings["codes"] = codes
-    if symbols and all(name in symbols for name, space in arrays.items() if len(space.shape) > 1):
+    others = [name for name, space in arrays.items() if len(space.shape) > 1 and name not in symbols]
+    if not others and not all(symbols.values()):
         settings["encoder"] = "grid"
     return settings
 

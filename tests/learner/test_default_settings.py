@@ -13,7 +13,7 @@ from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
-VECTOR = ArraySpace(shape=(17,), dtype="float32")
+VECTOR, PLANES = (ArraySpace(shape=shape, dtype="float32") for shape in ((17,), (10, 10, 4)))
 CHOICES, JOINTS = DiscreteSpace(counts=(4,)), ContinuousSpace(low=(-1.0,), high=(1.0,))
 
 
@@ -152,3 +152,28 @@ def test_rollouts_of_many_seats_are_no_larger(where: Spaces, seats: int, rows: i
 def test_components_to_leave_out_become_a_setting() -> None:
     assert default_settings(spaces(CHOICES, VECTOR), ["mission"])["environment"]["leave_out"] == ["mission"]
     assert "environment" not in default_settings(spaces(CHOICES, VECTOR))
+
+
+@pytest.mark.parametrize(
+    ("observations", "symbols", "policy"),
+    [
+        (
+            (DiscreteSpace(counts=(4,)), image(7, 7, 3)),
+            {"1": (11, 6, 4)},
+            {"codes": {"1": [11, 6, 4]}},
+        ),
+        ((image(19, 19, 3),), {"0": (11, 6, 4)}, {"codes": {"0": [11, 6, 4]}}),
+        ((VECTOR, PLANES), {"1": ()}, {"encoder": "grid"}),
+        ((PLANES, image(9, 9, 3)), {"0": ()}, {}),
+        ((image(7, 7, 3), image(96, 96, 3)), {"0": (11, 6, 4)}, {"codes": {"0": [11, 6, 4]}}),
+        ((image(7, 7, 3),), {}, {}),
+    ],
+)
+def test_planes_are_convolved_and_codes_one_hot(
+    observations: tuple[Any, ...], symbols: dict[str, tuple[int, ...]], policy: dict[str, Any]
+) -> None:
+    where = spaces(CHOICES, *observations)
+    settings = default_settings(where, symbols=symbols)
+    given = PolicySpec.model_validate(settings["policy"]).model_dump(mode="json", exclude_defaults=True)
+    assert {name: given[name] for name in ("codes", "encoder") if name in given} == policy
+    assert kind_of(where, symbols) == ("images" if image(96, 96, 3) in observations else "vectors_discrete")
