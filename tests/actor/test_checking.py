@@ -400,7 +400,7 @@ def test_minigrids_codes_are_told_from_its_pictures() -> None:
 @pytest.mark.parametrize(
     ("space", "is_map"),
     [
-        (Box(0.0, 1.0, (10, 10, 10), bool), True),
+        (Box(0.0, 1.0, (10, 10, 10), np.bool_), True),  # type: ignore[arg-type] - as MinAtar has it
         (Box(0, 1, (8, 6, 4), np.int8), True),
         (MultiBinary((5, 5, 30)), True),
         (Box(0, 1, (4, 10, 10), np.int8), False),  # planes first

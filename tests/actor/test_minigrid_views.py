@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("minigrid")
 
 from minigrid.core.grid import Grid
-from minigrid.envs import DoorKeyEnv
+from minigrid.envs.doorkey import DoorKeyEnv
 from minigrid.minigrid_env import MiniGridEnv
 
 from daedalus.actor.environments.minigrid_views import speed_up
@@ -42,11 +42,11 @@ def assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_observations_are_those_of_minigrid(name: str, kwargs: dict[str, Any]) -> None:
     """Two environments with the same seeds and actions, of which one is as MiniGrid makes it."""
-    made = gymnasium.make(name, disable_env_checker=True).unwrapped  # some have no such arguments
-    other = gymnasium.make(name, disable_env_checker=True).unwrapped
+    made: Any = gymnasium.make(name, disable_env_checker=True).unwrapped
+    other: Any = gymnasium.make(name, disable_env_checker=True).unwrapped
     for environment in (made, other):
         for key, value in kwargs.items():
-            setattr(environment, key, value)
+            setattr(environment, key, value)  # the constructors of some do not take them
     assert speed_up(made)
     random, carried = np.random.default_rng(0), 0
     for seed in range(2):
@@ -62,24 +62,16 @@ def test_observations_are_those_of_minigrid(name: str, kwargs: dict[str, Any]) -
     assert carried > 0 or "DoorKey" not in name
 
 
-def test_what_is_not_minigrids_own_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_minigrids_own_is_left_as_it_is() -> None:
     class OwnView(DoorKeyEnv):
         def gen_obs(self) -> dict[str, Any]:
             return {**super().gen_obs(), "image": np.zeros((7, 7, 3), np.uint8)}
 
     class OwnGrid(Grid):
-        def encode(self, vis_mask: Any = None) -> np.ndarray:
-            return super().encode(vis_mask) + np.uint8(100)
-
-        def slice(self, *part: int) -> Grid:
-            part_of = OwnGrid(part[2], part[3])
-            part_of.grid = super().slice(*part).grid
-            return part_of
-
-        def rotate_left(self) -> Grid:
-            rotated = OwnGrid(self.height, self.width)
-            rotated.grid = super().rotate_left().grid
-            return rotated
+        def slice(self, *place: Any, **named: Any) -> Grid:
+            part = super().slice(*place, **named)
+            part.grid = [None] * len(part.grid)
+            return part
 
     assert not speed_up(OwnView())
     assert not speed_up(gymnasium.make("CartPole-v1"))
@@ -90,4 +82,4 @@ def test_what_is_not_minigrids_own_is_left_as_it_is(monkeypatch: pytest.MonkeyPa
     environment.grid = OwnGrid(grid.width, grid.height)
     environment.grid.grid = grid.grid
     np.testing.assert_array_equal(environment.gen_obs()["image"], MiniGridEnv.gen_obs(environment)["image"])
-    assert environment.gen_obs()["image"].min() >= 100
+    assert environment.gen_obs()["image"][..., 0].max() == 1  # all empty
