@@ -30,8 +30,7 @@ class EnvironmentReport(Specification):
     time_limit: int | None = None  # at which gymnasium truncates episodes
     # Largest values seen in arrays of bytes, by component: in each place of the last axis, or in all places.
     byte_maxima: dict[str, tuple[int, ...]] = Field(default_factory=dict)
-    # Small maps that the encoder `grid` reads, with the number of codes of each channel; none for planes of 0 and 1.
-    symbols: dict[str, tuple[int, ...]] = Field(default_factory=dict)
+    codes: dict[str, tuple[int, ...]] = Field(default_factory=dict)  # of components that are codes, as policy.codes
     lengths: tuple[int, ...] = ()  # of the episodes that ended
     returns: tuple[float, ...] = ()
 
@@ -134,7 +133,7 @@ def small_bytes(report: EnvironmentReport, spec: RunSpec) -> str:
         return ""
     for name, maxima in report.byte_maxima.items():
         space, largest = report.spaces.observations.get(name), max(maxima)
-        if not isinstance(space, ArraySpace) or name in {*policy.codes, *report.symbols}:
+        if not isinstance(space, ArraySpace) or name in {*policy.codes, *report.codes}:
             continue
         if not 0 < largest < _SMALL_PIXEL or (largest == 1 and not space.is_image):
             continue

@@ -1,4 +1,4 @@
-"""What observations are besides their spaces: texts, codes, planes. And gymnasium's own environment checker."""
+"""What observations are besides their spaces: texts, codes. And gymnasium's own environment checker."""
 
 import functools
 import importlib
@@ -103,27 +103,6 @@ def minigrid_codes(environment: gymnasium.Env, space: gymnasium.Space, seed: int
             and not unfit_code(leaf.of(observation), codes)
         }
     return {}
-
-
-_FEWEST_CELLS, _MOST_CELLS = 5, 32  # of a side of a map
-
-
-def plane_maps(space: gymnasium.Space) -> tuple[str, ...]:
-    """Return the components that are small maps of planes: (height, width, planes) of bool, or of 0 to 1."""
-    return tuple(leaf.name for leaf in leaves(space, "observation") if _is_plane_map(leaf.space))
-
-
-def _is_plane_map(space: gymnasium.Space) -> bool:
-    shape = space.shape or ()
-    if len(shape) != 3 or min(shape[:2]) < _FEWEST_CELLS or max(shape[:2]) > _MOST_CELLS:
-        return False
-    if shape[0] != shape[1] and shape[2] >= min(shape[:2]):  # perhaps (planes, height, width)
-        return False
-    if isinstance(space, gymnasium.spaces.MultiBinary) or space.dtype == np.bool_:
-        return True
-    if not isinstance(space, gymnasium.spaces.Box) or space.dtype is None or space.dtype.kind not in "iu":
-        return False
-    return bool((space.low == 0).all() and (space.high == 1).all())
 
 
 def _shown(text: str) -> str:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import Texts, minigrid_codes, plane_maps
+from daedalus.actor.checking.checker import Texts, minigrid_codes
 from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
@@ -254,12 +254,12 @@ def _check_one(
         rest = rest.model_copy(update={"leave_out": (*rest.leave_out, *texts.names)})
         space = without(environment.observation_space, rest.leave_out)
         transforms = Transforms(rest, environment.observation_space, environment.action_space, mask)
-        symbols: dict[str, tuple[int, ...]] = dict.fromkeys(plane_maps(space), ())
-        symbols |= minigrid_codes(environment, space, seed)
+        altered = rest.grey or rest.resize is not None  # as pixels are
+        codes = {} if altered else minigrid_codes(environment, space, seed)
         play = _Play(spec, environment, space, transforms, RandomActions(transforms.spaces.actions, seed), texts)
         if seconds > 0.0:
             play.run(seconds, env_steps, seed)
-        return play.report().model_copy(update={"symbols": symbols})
+        return play.report().model_copy(update={"codes": codes})
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     finally:

@@ -23,7 +23,7 @@ def default_settings(
     spaces: Spaces | None,
     leave_out: Sequence[str] = (),
     seats: int = 1,
-    symbols: Mapping[str, tuple[int, ...]] = MappingProxyType({}),
+    codes: Mapping[str, tuple[int, ...]] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the default settings for the spaces of an environment, as a preset has them.
 
@@ -31,9 +31,9 @@ def default_settings(
       spaces: of the environment without transforms; None if they are not known.
       leave_out: components of the observation that are not in `spaces`.
       seats: agents of a game that the policy plays: each has rows of its own.
-      symbols: small maps among the observations, with the number of codes of each channel; none for planes.
+      codes: components of the observation that are codes, as `policy.codes` has them.
     """
-    kind = _UNKNOWN if spaces is None else kind_of(spaces, symbols)
+    kind = _UNKNOWN if spaces is None else kind_of(spaces, codes)
     file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
     settings = tomllib.loads(file.read_text("utf-8"))
     if kind == "large_images" and spaces is not None and any(space.image_shape[0] != _RGB for space in _images(spaces)):
@@ -51,25 +51,11 @@ def default_settings(
         for collection in (settings["collection"], settings["with_memory"]["collection"]):
             collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)
     if spaces is not None:
-        settings["policy"] |= _symbol_settings(spaces, symbols)
         _fit_rollouts(settings, spaces, seats)
+    if codes:
+        settings["policy"]["codes"] = {name: list(numbers) for name, numbers in codes.items()}
     if leave_out:
         settings.setdefault("environment", {})["leave_out"] = list(leave_out)
-    return settings
-
-
-def _symbol_settings(spaces: Spaces, symbols: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Return the settings of the policy for small maps: codes become one-hot, and planes are convolved.
-
-    Planes are not convolved beside another array of several axes, whose encoder could be another.
-    """
-    arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
-    settings: dict[str, Any] = {}
-    if codes := {name: list(each) for name, each in symbols.items() if each}:
-        settings["codes"] = codes
-    others = [name for name, space in arrays.items() if len(space.shape) > 1 and name not in symbols]
-    if not others and not all(symbols.values()):
-        settings["encoder"] = "grid"
     return settings
 
 
@@ -99,12 +85,12 @@ def _fit_rollouts(settings: dict[str, Any], spaces: Spaces, seats: int) -> None:
         each["collection"]["rollout_length"] = min(each["collection"]["rollout_length"], shortest)
 
 
-def kind_of(spaces: Spaces, symbols: Collection[str] = ()) -> Kind:
+def kind_of(spaces: Spaces, coded: Collection[str] = ()) -> Kind:
     """Return the kind of spaces: with an image, else with continuous actions, else with discrete ones only.
 
-    A map of `symbols` is no image.
+    A component in `coded` is no image.
     """
-    images = _images(spaces, symbols)
+    images = _images(spaces, coded)
     if images:
         return "large_images" if any(max(space.image_shape[1:]) > _LARGE for space in images) else "images"
     return "vectors_continuous" if _has_continuous(spaces) else "vectors_discrete"
@@ -123,6 +109,6 @@ def _noise_scale(spaces: Spaces) -> float:
     return min(1.0, math.sqrt(_FULL_NOISE / numbers))
 
 
-def _images(spaces: Spaces, symbols: Collection[str] = ()) -> list[ArraySpace]:
-    observed = [space for name, space in spaces.observations.items() if name not in symbols]
+def _images(spaces: Spaces, coded: Collection[str] = ()) -> list[ArraySpace]:
+    observed = [space for name, space in spaces.observations.items() if name not in coded]
     return [space for space in observed if isinstance(space, ArraySpace) and space.is_image]

@@ -22,7 +22,7 @@ from daedalus.actor.checking.check_report import (
     stacked_images,
     uninformative_bounds,
 )
-from daedalus.actor.checking.checker import gymnasium_notes, plane_maps
+from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment, unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
 from daedalus.actor.environments.precision import Precision
@@ -385,34 +385,16 @@ def test_minigrids_codes_are_told_from_its_pictures() -> None:
     """Both are declared as bytes from 0 to 255, and pictures of one pixel a cell have the same shape."""
     pytest.importorskip("minigrid")
 
-    def symbols(**settings: object) -> dict[str, tuple[int, ...]]:
+    def codes(**settings: object) -> dict[str, tuple[int, ...]]:
         spec = EnvironmentSpec.model_validate({"id": "MiniGrid-LavaGapS5-v0", "leave_out": ("mission",), **settings})
         wrappers = UserModules(frozenset({"minigrid.wrappers"}))
         report = check_environment(spec, wrappers, seconds=0.0, env_steps=0)
         assert not report.problems
-        return report.symbols
+        return report.codes
 
-    assert symbols() == symbols(wrap="minigrid.wrappers:FullyObsWrapper") == {"image": (11, 6, 4)}
-    assert symbols(wrap="minigrid.wrappers:RGBImgPartialObsWrapper") == {}
-    assert symbols(wrap="minigrid.wrappers:FlatObsWrapper", leave_out=()) == {}
-
-
-@pytest.mark.parametrize(
-    ("space", "is_map"),
-    [
-        (Box(0.0, 1.0, (10, 10, 10), np.bool_), True),  # type: ignore[arg-type] - as MinAtar has it
-        (Box(0, 1, (8, 6, 4), np.int8), True),
-        (MultiBinary((5, 5, 30)), True),
-        (Box(0, 1, (4, 10, 10), np.int8), False),  # planes first
-        (Box(0, 2, (8, 6, 4), np.int8), False),
-        (Box(0.0, 1.0, (8, 6, 4), np.float32), False),  # perhaps an image
-        (Box(0, 1, (40, 40, 3), np.int8), False),
-        (MultiBinary(8), False),
-        (Discrete(4), False),
-    ],
-)
-def test_small_maps_of_planes_are_known_by_their_space(space: gymnasium.Space, is_map: bool) -> None:
-    assert plane_maps(Dict({"a": space, "b": Discrete(2)})) == (("a",) if is_map else ())
+    assert codes() == codes(wrap="minigrid.wrappers:FullyObsWrapper") == {"image": (11, 6, 4)}
+    assert codes(wrap="minigrid.wrappers:RGBImgPartialObsWrapper") == {}
+    assert codes(wrap="minigrid.wrappers:FlatObsWrapper", leave_out=()) == {}
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
-VECTOR, PLANES = (ArraySpace(shape=shape, dtype="float32") for shape in ((17,), (10, 10, 4)))
+VECTOR = ArraySpace(shape=(17,), dtype="float32")
 CHOICES, JOINTS = DiscreteSpace(counts=(4,)), ContinuousSpace(low=(-1.0,), high=(1.0,))
 
 
@@ -155,25 +155,17 @@ def test_components_to_leave_out_become_a_setting() -> None:
 
 
 @pytest.mark.parametrize(
-    ("observations", "symbols", "policy"),
+    ("observations", "codes", "kind"),
     [
-        (
-            (DiscreteSpace(counts=(4,)), image(7, 7, 3)),
-            {"1": (11, 6, 4)},
-            {"codes": {"1": [11, 6, 4]}},
-        ),
-        ((image(19, 19, 3),), {"0": (11, 6, 4)}, {"codes": {"0": [11, 6, 4]}}),
-        ((VECTOR, PLANES), {"1": ()}, {"encoder": "grid"}),
-        ((PLANES, image(9, 9, 3)), {"0": ()}, {}),
-        ((image(7, 7, 3), image(96, 96, 3)), {"0": (11, 6, 4)}, {"codes": {"0": [11, 6, 4]}}),
-        ((image(7, 7, 3),), {}, {}),
+        ((CHOICES, image(7, 7, 3)), {"1": (11, 6, 4)}, "vectors_discrete"),
+        ((image(19, 19, 3),), {"0": (11, 6, 4)}, "vectors_discrete"),
+        ((image(7, 7, 3), image(96, 96, 3)), {"0": (11, 6, 4)}, "images"),
+        ((image(7, 7, 3),), {}, "vectors_discrete"),
     ],
 )
-def test_planes_are_convolved_and_codes_one_hot(
-    observations: tuple[Any, ...], symbols: dict[str, tuple[int, ...]], policy: dict[str, Any]
+def test_codes_are_no_images_and_are_set(
+    observations: tuple[Any, ...], codes: dict[str, tuple[int, ...]], kind: str
 ) -> None:
     where = spaces(CHOICES, *observations)
-    settings = default_settings(where, symbols=symbols)
-    given = PolicySpec.model_validate(settings["policy"]).model_dump(mode="json", exclude_defaults=True)
-    assert {name: given[name] for name in ("codes", "encoder") if name in given} == policy
-    assert kind_of(where, symbols) == ("images" if image(96, 96, 3) in observations else "vectors_discrete")
+    assert PolicySpec.model_validate(default_settings(where, codes=codes)["policy"]).codes == codes
+    assert kind_of(where, codes) == kind
