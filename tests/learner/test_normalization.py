@@ -21,9 +21,9 @@ from daedalus.algorithms.normalization import (
     observations_name,
 )
 from daedalus.algorithms.running_returns import RunningReturns
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
-from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 from daedalus.protocol.uploads import Rollout
