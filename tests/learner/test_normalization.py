@@ -9,7 +9,7 @@ import torch
 from building import POLICY, identity, join, make_rollout
 from plain import NAME, plain
 
-from daedalus.algorithms import normalization, running_returns
+from daedalus.algorithms import normalization
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.normalization import (
     ConfirmedRanges,
@@ -20,7 +20,7 @@ from daedalus.algorithms.normalization import (
     moments_of,
     observations_name,
 )
-from daedalus.algorithms.running_returns import RunningReturns
+from daedalus.algorithms.running_returns import Streams
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.policy.normalized import normalized_components
@@ -213,14 +213,16 @@ def test_returns_run_on_over_rows_that_a_client_does_not_send() -> None:
     assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
 
 
-def test_running_returns_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running_returns, "_MAX_STREAMS", 2)
-    returns = RunningReturns(DISCOUNT)
-    for rollout in [sent(0, actor) for actor in "abc"]:
-        returns.add(rollout)
-    assert [stream.actor for stream in returns._running] == ["b", "c"]
-    returns.add(sent(1, "b"))
-    assert [stream.actor for stream in returns._running] == ["c", "b"]
+def test_streams_that_were_put_first_are_forgotten() -> None:
+    streams = Streams[int](most=5)
+    for number, actor in enumerate("abc"):
+        streams.put(sent(0, actor), number, size=2)
+    assert streams.has_forgotten
+    assert [streams.take(sent(1, actor)) for actor in "abca"] == [None, 1, 2, None]
+    streams.put(sent(0, "d"), 3, size=6)  # alone too large
+    assert streams.take(sent(1, "d")) is None
+    streams.put(sent(0, "e"), 4, size=5)
+    assert streams.take(sent(1, "e")) == 4
 
 
 def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None:
