@@ -57,8 +57,8 @@ class FirstVisits:
         if self._streams.has_forgotten and not self._has_warned:
             self._has_warned = True
             _logger.warning(
-                "curiosity remembers at most %s observations of all running episodes, and forgets those of the actors "
-                "that are silent longest: their next rollouts are rewarded as if their episodes began there",
+                "curiosity remembers at most %s observations of all running episodes, and has forgotten those of some "
+                "environments: their next rollouts are rewarded as if their episodes began there",
                 f"{_MOST_OBSERVATIONS:,}",
             )
         return first

@@ -1,10 +1,12 @@
 """Discounted returns that run on from rollout to rollout of the same environments. State; no I/O, no threads."""
 
 import zlib
+from collections import Counter
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from daedalus.protocol.keys import owner
 from daedalus.protocol.uploads import Rollout
 
 _MOST_STREAMS = 4096  # with states of size 1
@@ -36,23 +38,33 @@ class Streams(Generic[_State]):
         """
         self._synchronous, self._most = synchronous, most
         self._kept: dict[_Stream, tuple[_State, int]] = {}  # after the last row, with its size, by what comes next
-        self._size = 0  # of all
+        self._sizes = Counter[str]()  # of all, by owner (protocol/keys.py)
         self.has_forgotten = False
 
     def take(self, rollout: Rollout) -> _State | None:
         """Return the state before row 0 of a rollout, once; None if its environments are new or were forgotten."""
-        state, size = self._kept.pop(self._stream(rollout, 0), (None, 0))
-        self._size -= size
-        return state
+        return self._pop(self._stream(rollout, 0))
 
     def put(self, rollout: Rollout, state: _State, size: int = 1) -> None:
-        """Keep the state after the last row of a rollout. At capacity, forget those that were put first."""
+        """Keep the state after the last row of a rollout.
+
+        At capacity, the owner of the most forgets what was put first: no owner can then push out the others.
+        """
         stream = self._stream(rollout, rollout.rows)
-        self._size += size - self._kept.pop(stream, (None, 0))[1]
+        self._pop(stream)
         self._kept[stream] = state, size
-        while self._size > self._most:
-            self._size -= self._kept.pop(next(iter(self._kept)))[1]
+        self._sizes[owner(stream.actor)] += size
+        while self._sizes.total() > self._most:
+            largest = self._sizes.most_common(1)[0][0]
+            self._pop(next(each for each in self._kept if owner(each.actor) == largest))
             self.has_forgotten = True
+
+    def _pop(self, stream: _Stream) -> _State | None:
+        state, size = self._kept.pop(stream, (None, 0))
+        if size:
+            self._sizes[owner(stream.actor)] -= size
+            self._sizes += Counter()  # without those of size 0
+        return state
 
     def _stream(self, rollout: Rollout, row: int) -> _Stream:
         """Return the stream of a rollout, before its row 0 or after its last one."""

@@ -213,16 +213,18 @@ def test_returns_run_on_over_rows_that_a_client_does_not_send() -> None:
     assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
 
 
-def test_streams_that_were_put_first_are_forgotten() -> None:
-    streams = Streams[int](most=5)
-    for number, actor in enumerate("abc"):
-        streams.put(sent(0, actor), number, size=2)
+def test_owner_of_the_largest_streams_forgets_the_first_of_them() -> None:
+    streams = Streams[int](most=6)
+    for number, actor in enumerate(["small", "large.0", "large.1"]):
+        streams.put(make_rollout(identity(actor, 0)), number, size=2)
+    assert not streams.has_forgotten
+    streams.put(make_rollout(identity("large.2", 0)), 3, size=4)  # the first two of this owner are enough
     assert streams.has_forgotten
-    assert [streams.take(sent(1, actor)) for actor in "abca"] == [None, 1, 2, None]
-    streams.put(sent(0, "d"), 3, size=6)  # alone too large
-    assert streams.take(sent(1, "d")) is None
-    streams.put(sent(0, "e"), 4, size=5)
-    assert streams.take(sent(1, "e")) == 4
+    assert [streams.take(make_rollout(identity(f"large.{index}", 1))) for index in range(3)] == [None, None, 3]
+    streams.put(make_rollout(identity("huge", 0)), 4, size=7)  # more than all may have
+    assert streams.take(make_rollout(identity("huge", 1))) is None
+    assert streams.take(make_rollout(identity("small", 1))) == 0
+    assert streams.take(make_rollout(identity("small", 1))) is None
 
 
 def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None:
