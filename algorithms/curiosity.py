@@ -14,6 +14,7 @@ from daedalus.algorithms.normalization import RewardNormalizer
 from daedalus.algorithms.running_returns import Streams
 from daedalus.protocol.uploads import Rollout
 
+METRICS = ("first_visit_fraction", "curiosity_reward_mean")
 _MOST_OBSERVATIONS = 2_000_000  # of all running episodes together, about 200 MB
 _JUDGED_ROWS = 4096  # the first ones
 _MOST_NEW = 0.95  # share of first visits, above which observations do not come back
@@ -117,12 +118,12 @@ class Curiosity:
             column += rollout.environments
 
     def metrics(self) -> dict[str, float]:
-        """Return means over the rows to learn from of the newest batch; empty without such rows."""
+        """Return METRICS, means over the rows to learn from of the newest batch; empty without such rows."""
         learned = [first[each.learned] for each, first in self._newest.items()]
         if not sum(map(len, learned)):
             return {}
         share = float(np.concatenate(learned).mean())
-        return {"first_visit_fraction": share, "curiosity_reward_mean": share * self._factor}
+        return dict(zip(METRICS, (share, share * self._factor), strict=True))
 
     def _judge(self) -> None:
         """Warn once, after enough rows, if observations do not come back."""
