@@ -69,9 +69,10 @@ def outcome(means: Sequence[float], side: int) -> int:
     return 1 if math.isclose(own, best, rel_tol=1e-9, abs_tol=1e-9) else 0 if own > best else 2
 
 
-def rating_copies(league: LeagueSpec, agents: Sequence[str]) -> int:
-    """Return how many copies of a game only rate players, besides those that are learned from."""
-    return 1 if league.rating_share > 0.0 and len(sides_of(league, agents)) > 1 else 0
+def rating_copies(league: LeagueSpec, copies: int, agents: Sequence[str]) -> int:
+    """Return how many copies of a game only rate players, besides `copies` that are learned from."""
+    share = league.rating_share
+    return math.ceil(share / (1.0 - share) * copies) if len(sides_of(league, agents)) > 1 else 0
 
 
 def _shares_without_opponents(league: LeagueSpec) -> str:

@@ -413,7 +413,7 @@ class RolloutIntake:
         return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
 
     def _count_matches(self, content: Upload | Rejected) -> None:
-        """Count the results of matches in a rollout that was received for the first time, also if it is not learned from."""
+        """Count the results of matches in a rollout that was received for the first time, even if not learned from."""
         if self._league is not None and isinstance(content, Rollout) and content.matches is not None:
             self._league.add(content.matches)
 

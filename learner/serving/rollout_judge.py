@@ -226,7 +226,7 @@ class RolloutJudge:
         rows = self._spec.collection.rollout_length * min(upload.identity.sequence + 1, _LOST * (actor.uploads + 1))
         if actor.environments == 1 or self._spec.algorithm.synchronous or self._spec.environment.is_game:
             rows += int(_CLIENT_ROWS * (now - actor.joined + _BEGIN_SECONDS))
-        if actor.matches + matches > rows * (actor.environments + 1):  # one copy of the game may only rate
+        if actor.matches + matches > rows * 2 * actor.environments:  # as many copies of the game may only rate
             return f"it reports {matches} matches, and {actor.matches} before, but has played at most {rows} rows"
         longest, total = int(lengths.max(initial=0)), sum(lengths.tolist())
         if longest > rows or actor.episode_rows + total > rows * actor.environments:
