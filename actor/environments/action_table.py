@@ -1,13 +1,17 @@
 """Action tables: discrete choices over all numbers of a continuous action, or over some of them."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.components import BoundedActions, continuous_space
+from daedalus.actor.environments.components import BoundedActions, continuous_space, exported_dtype
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
+
+if TYPE_CHECKING:
+    from daedalus.policy.saving.onnx_graph import OnnxGraph
 
 _CHOICE, _REST = "table", "continuous"  # components of an action of which the table gives a part
 
@@ -61,6 +65,17 @@ class TableActions:
         actions[:, self._columns] = self._table[values[_CHOICE][:, 0]]
         actions[:, self._rest] = self._rest_actions.of(values[_REST])
         return actions.reshape(len(actions), *self._space.shape)
+
+    def add_outputs(self, graph: "OnnxGraph", values: Mapping[str, str]) -> None:
+        """Add what `env_actions` does to an ONNX graph: the output `action`."""
+        choice = graph.reshaped(values[_CHOICE if self._rest.size else "action"], ())
+        actions = graph.add("Gather", graph.constant(self._table), choice, axis=0)
+        if self._rest.size:
+            actions = graph.add("Concat", actions, self._rest_actions.exported(graph, values[_REST]), axis=1)
+            order = np.argsort(np.concatenate([self._columns, self._rest]))
+            actions = graph.add("Gather", actions, graph.constant(order, np.int64), axis=1)
+        dtype = exported_dtype(self._space)
+        graph.output("action", graph.cast(actions, dtype), dtype, self._space.shape)
 
 
 def _checked_columns(columns: tuple[int, ...], space: gymnasium.spaces.Box, size: int) -> np.ndarray:

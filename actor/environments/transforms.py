@@ -1,7 +1,7 @@
 """The transforms of a specification, applied to a backend's environments: components, action table, pixels, masks."""
 
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -23,6 +23,9 @@ from daedalus.actor.environments.pixels import Pixels
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed, Step
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from daedalus.policy.saving.onnx_graph import OnnxGraph
 
 _logger = logging.getLogger(__name__)
 
@@ -122,6 +125,35 @@ class Transforms:
             if unfit := unfit_number(frames):
                 raise ValueError(f"component {name!r} of the observation {unfit}")
         return observed
+
+    def add_inputs(self, graph: "OnnxGraph") -> tuple[dict[str, str], dict[str, str]]:
+        """Add what `observe` and the frame stacks do to an ONNX graph. Return values of observations and masks.
+
+        The inputs have the names of the components. A mask is the input action_mask, or action_mask.NAME where the
+        action has several components, also if the observation contains it.
+        """
+        values = {}
+        for component in self._observations:
+            name, frames = component.leaf.name, component.add_input(graph)
+            if name in self._pixels:
+                frames = self._pixels[name].exported(graph, frames)
+            space = self.spaces.observations[name]
+            if isinstance(space, ArraySpace) and space.frames > 1:
+                dtype = np.uint8 if space.dtype == "uint8" else np.float32
+                frames = graph.stacked(name, frames, space.shape, dtype, space.frames)
+            values[name] = frames
+        masks = {
+            name: graph.input(self.mask_input(name), np.bool_, (size,)) for name, size in self.spaces.masks.items()
+        }
+        return values, masks
+
+    def mask_input(self, action: str) -> str:
+        """Return the input of the mask of an action component; see add_inputs."""
+        return MASK_KEY if len(self.spaces.actions) == 1 else f"{MASK_KEY}.{action}"
+
+    def add_outputs(self, graph: "OnnxGraph", values: dict[str, str]) -> None:
+        """Add what `env_actions` does to an ONNX graph, for values of the run's actions."""
+        self._actions.add_outputs(graph, values)
 
     def env_actions(self, actions: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for the run's {name: [E, D]}."""
