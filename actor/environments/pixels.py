@@ -167,7 +167,8 @@ def _exported_resize(graph: "OnnxGraph", frames: str, shape: Shape, size: tuple[
     sums = graph.add("MatMul", sums, graph.constant(_overlap_matrix(width, size[1]).T))
     if len(shape) == 3:
         sums = graph.add("Transpose", sums, perm=[0, 2, 3, 1])
-    means = graph.add("Div", sums, graph.constant(height * width))
+    # Of a division after a product, onnxruntime makes factors of the product, which rounds in another way.
+    means = graph.add("Div", graph.add("Abs", sums), graph.constant(height * width))
     return graph.cast(graph.add("Round", means), np.uint8)
 
 

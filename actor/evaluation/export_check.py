@@ -42,6 +42,10 @@ class ExportedPlayer(Policy):
         self._rows = next(iter(self._inputs.values())).shape[0]
         self._rows = self._rows if isinstance(self._rows, int) else 1
         self._outputs = [entry.name for entry in self._session.get_outputs()]
+        self._seen, self._acted = (
+            leaves(space, name)
+            for space, name in ((self.observation_space, "observation"), (self.action_space, "action"))
+        )
         self.choices = self.different = 0  # actions, and those that differ from the policy's
         self.largest_difference = 0.0
 
@@ -60,7 +64,7 @@ class ExportedPlayer(Policy):
         feed: dict[str, np.ndarray] = dict(self._states)
         observed = self._transforms.observe_one(observation, action_mask)
         masks = {self._transforms.mask_input(name): mask[0] for name, mask in observed.masks.items()}
-        for leaf in leaves(self.observation_space, "observation"):
+        for leaf in self._seen:
             if leaf.name in self._inputs and leaf.name not in masks:
                 masks[leaf.name] = leaf.of(observation)
         for name, values in masks.items():
@@ -76,7 +80,7 @@ class ExportedPlayer(Policy):
         results = dict(zip(self._outputs, values, strict=True))
         self._states = {name: results[f"next_{name}"] for name in self._states}
         parts = {}
-        for leaf in leaves(self.action_space, "action"):
+        for leaf in self._acted:
             name = leaf.name if leaf.name not in self._inputs else f"actions/{leaf.name}"
             parts[leaf.path] = results[name][0].astype(leaf.space.dtype)
         theirs = nested(self.action_space, (), parts)
@@ -85,7 +89,7 @@ class ExportedPlayer(Policy):
 
     def _compare(self, ours: Any, theirs: Any) -> None:
         differs = False
-        for leaf in leaves(self.action_space, "action"):
+        for leaf in self._acted:
             expected, found = leaf.of(ours).astype(np.float64), leaf.of(theirs).astype(np.float64)
             difference = float((np.abs(expected - found) / np.maximum(1.0, np.abs(expected))).max())
             continuous = isinstance(leaf.space, gym.Box)
