@@ -62,7 +62,7 @@ class ExportedPlayer(Policy):
     def _choose(self, observation: Any, action_mask: Any, sampled: bool) -> Any:
         size = self._runtime.noise_size
         feed: dict[str, np.ndarray] = dict(self._states)
-        observed = self._transforms.observe_one(observation, action_mask)
+        observed = self._observed(observation, action_mask)
         masks = {self._transforms.mask_input(name): mask[0] for name, mask in observed.masks.items()}
         for leaf in self._seen:
             if leaf.name in self._inputs and leaf.name not in masks:
