@@ -12,7 +12,7 @@ from gymnasium import spaces as gym
 
 from daedalus.actor.environments.components import leaves, nested, only_of_batch, stacked
 from daedalus.actor.environments.games import GameEnvironments
-from daedalus.actor.evaluation.loaded_policy import Policy
+from daedalus.actor.evaluation.loaded_policy import Policy, another_player, environments_of
 from daedalus.policy.saving.onnx_graph import NOISE, noise_of
 
 _LONGEST_EPISODE = 10_000  # steps; an environment may have no limit of its own
@@ -28,7 +28,7 @@ class ExportedPlayer(Policy):
     @classmethod
     def of(cls, policy: Policy, model: bytes) -> "ExportedPlayer":
         """Return a player of an ONNX file that `policy` was exported to."""
-        player = policy.copied(cls)
+        player = another_player(policy, cls)
         player._load(model)
         player.reset(seed=0)
         return player
@@ -129,7 +129,7 @@ def play_exported(
     Raises EnvironmentSetupError if the environment cannot be made or fails.
     """
     done, total, returns = 0, 0.0, []
-    with closing(policy.make_environments()) as environments:
+    with closing(environments_of(policy)) as environments:
         players = [ExportedPlayer.of(policy, model) for _ in range(environments.count)]
 
         def act(seat: int, observation: Any, mask: Any) -> Any:

@@ -179,30 +179,7 @@ class Policy:
 
         options = ExportOptions(sampled=sampled, rows=rows, quantize=quantize, licence=licence)
         check_new(Path(path))
-        write_new(Path(path), self.exported(options))
-
-    def exported(self, options: "ExportOptions") -> bytes:
-        """Return the ONNX file of the policy. Raises ExportError."""
-        from daedalus.actor.evaluation.exported_policy import exported_file  # `act` does not need it
-
-        spaces, environment = (self.observation_space, self.action_space), self.spec.environment
-        caller = {
-            "repeat_each_action": self._repeat,
-            "maximum_of_two_frames": self._pools_frames,
-            "left_out": environment.leave_out,
-        }
-        return exported_file(self._saved, self._transforms, spaces, self._runtime.noise_size, options, caller)
-
-    def copied(self, kind: "type[_Kind]") -> "_Kind":
-        """Return another player of the same policy, at the start of an episode."""
-        return kind(self._saved, self.observation_space, self.action_space, self._modules)
-
-    def make_environments(self) -> BackendEnvironments:
-        """Return the run's environment, of which the caller, as that of `act`, repeats the actions.
-
-        Raises EnvironmentSetupError.
-        """
-        return _make(self.spec, self._modules, action_repeat=1)
+        write_new(Path(path), exported_bytes(self, options))
 
     def _estimator(self) -> "ValueEstimator":
         if self._network is None:
@@ -247,6 +224,32 @@ class Policy:
     def _decide(self, observation: Any, action_mask: Any, noise: Noise) -> Any:
         self._running.observe(self._observed(observation, action_mask))
         return self._transforms.env_action(self._running.act(noise).actions)
+
+
+def exported_bytes(policy: Policy, options: "ExportOptions") -> bytes:
+    """Return the ONNX file of a policy. Raises ExportError."""
+    from daedalus.actor.evaluation.exported_policy import exported_file  # `act` does not need it
+
+    caller = {
+        "repeat_each_action": policy._repeat,
+        "maximum_of_two_frames": policy._pools_frames,
+        "left_out": policy.spec.environment.leave_out,
+    }
+    spaces, size = (policy.observation_space, policy.action_space), policy._runtime.noise_size
+    return exported_file(policy._saved, policy._transforms, spaces, size, options, caller)
+
+
+def another_player(policy: Policy, kind: type[_Kind]) -> _Kind:
+    """Return another player of the same policy, of a class that derives from Policy, at the start of an episode."""
+    return kind(policy._saved, policy.observation_space, policy.action_space, policy._modules)
+
+
+def environments_of(policy: Policy) -> BackendEnvironments:
+    """Return the run's environment, of which the caller, as that of `act`, repeats the actions.
+
+    Raises EnvironmentSetupError.
+    """
+    return _make(policy.spec, policy._modules, action_repeat=1)
 
 
 def load_policy(

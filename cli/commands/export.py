@@ -120,7 +120,7 @@ def _export(parsed: argparse.Namespace) -> list[str]:
     """Write the file, and return what to say of it."""
     from daedalus.actor.evaluation.export_check import play_exported
     from daedalus.actor.evaluation.exported_policy import ExportOptions, check_new, inputs_and_outputs, write_new
-    from daedalus.actor.evaluation.loaded_policy import load_policy
+    from daedalus.actor.evaluation.loaded_policy import exported_bytes, load_policy
 
     options = ExportOptions(sampled=parsed.sampled, rows=parsed.rows, quantize=parsed.quantize, licence=parsed.licence)
     check_new(parsed.output)
@@ -131,7 +131,7 @@ def _export(parsed: argparse.Namespace) -> list[str]:
         from_hub=parsed.from_hub,
         allow_modules=parsed.allow_module,
     )
-    model = policy.exported(options)
+    model = exported_bytes(policy, options)
     notes = []
     if parsed.check:
         played = play_exported(policy, model, sampled=parsed.sampled, seed=_SEED, steps=_CHECKED_STEPS)
@@ -139,7 +139,7 @@ def _export(parsed: argparse.Namespace) -> list[str]:
             raise ExportError(f"the file does not play as the policy does, and is not written: {played}")
         notes.append(f"check: in {played.steps} steps, {played}")
     if parsed.quantize is not None:
-        plain = policy.exported(ExportOptions(sampled=parsed.sampled, rows=parsed.rows))
+        plain = exported_bytes(policy, ExportOptions(sampled=parsed.sampled, rows=parsed.rows))
         before, after = (
             play_exported(policy, each, sampled=parsed.sampled, seed=_SEED, episodes=parsed.episodes)
             for each in (plain, model)

@@ -18,6 +18,7 @@ from daedalus.actor.environments.components import leaves
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.evaluation.export_check import ExportedPlayer
 from daedalus.actor.evaluation.exported_policy import ExportOptions
+from daedalus.actor.evaluation.loaded_policy import exported_bytes
 from daedalus.cli.commands.export import export
 from daedalus.learner.run.settings import preset_names, read_preset
 from daedalus.policy.saving.saved_policy import read_policy
@@ -129,7 +130,7 @@ def test_file_chooses_the_actions_of_the_policy(tmp_path: Path, name: str) -> No
     policy = policy_of(tmp_path / "run", case)
     policy.observation_space.seed(4)
     random = np.random.default_rng(4)
-    player = ExportedPlayer.of(policy, policy.exported(ExportOptions(rows=2 if name == "nested" else None)))
+    player = ExportedPlayer.of(policy, exported_bytes(policy, ExportOptions(rows=2 if name == "nested" else None)))
     seen = set()
     images = any(leaf.space.dtype == np.uint8 for leaf in leaves(policy.observation_space, "observation"))
     for number in range(200 if images else OBSERVATIONS):
@@ -159,7 +160,7 @@ def test_file_chooses_the_actions_of_the_policy(tmp_path: Path, name: str) -> No
 @pytest.mark.parametrize("name", ["masked", "recurrent"])
 def test_sampled_file_makes_its_samples_from_uniform_numbers(tmp_path: Path, name: str) -> None:
     policy = policy_of(tmp_path / "run", CASES[name])
-    player = ExportedPlayer.of(policy, policy.exported(ExportOptions(sampled=True, rows=1)))
+    player = ExportedPlayer.of(policy, exported_bytes(policy, ExportOptions(sampled=True, rows=1)))
     masks = {"0": np.array([True, False, True]), "1": np.ones(5, np.bool_)} if CASES[name].masked else None
     observation = np.zeros(5, np.float32)
     seen = [str(player.act(observation, sampled=True, action_mask=masks)) for _ in range(50)]
@@ -204,7 +205,7 @@ def test_a_file_has_the_operators_that_converters_and_old_runtimes_know(tmp_path
 @pytest.mark.parametrize("quantize", ["float16", "int8"])
 def test_smaller_numbers_choose_nearly_the_same_actions(tmp_path: Path, quantize: Any) -> None:
     policy = policy_of(tmp_path / "run", CASES["squashed"])
-    model = policy.exported(ExportOptions(quantize=quantize))
+    model = exported_bytes(policy, ExportOptions(quantize=quantize))
     player = ExportedPlayer.of(policy, model)
     for number in range(50):
         player.act(1 + number % 5)
