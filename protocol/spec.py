@@ -340,6 +340,10 @@ class TrainingSpec(LossSpec):
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
 
+    curiosity: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    """Weight of a reward for each observation that is new in its episode, for goals that random actions hardly ever
+    reach; try 1. It falls linearly to 0 over the budget. 0: none. Observations must come back, as grids do."""
+
     optimizer: Literal["adam", "rmsprop"] = "adam"
     """Optimiser of the network's parameters."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
@@ -600,6 +604,15 @@ class RunSpec(Specification):
             raise ValueError(
                 f"collection.upload is gradients, but {self.training.algorithm} {kind} a batch, which only the learner "
                 "can do: use a3c, a2c or n_step_q, or set collection.upload=rollouts"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _curiosity_sees_rollouts(self) -> "RunSpec":
+        if self.uploads_gradients and self.training.curiosity:
+            raise ValueError(
+                "training.curiosity needs rollouts, and with collection.upload=gradients none reach the learner: "
+                "set collection.upload=rollouts, or training.curiosity=0"
             )
         return self
 
