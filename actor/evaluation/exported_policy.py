@@ -6,7 +6,6 @@ Atari game, and to leave out components.
 
 import importlib.metadata
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -117,16 +116,15 @@ def exported_file(
 def write_new(path: Path, content: bytes) -> None:
     """Write a file that does not exist yet. Raises ExportError if it exists, or cannot be written."""
     check_new(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        partial.write_bytes(content)
-        os.link(partial, path)  # fails if somebody else wrote the file meanwhile
-    except FileExistsError:
-        check_new(path)
+        with open(path, "xb") as file:  # fails if somebody else wrote the file meanwhile
+            try:
+                file.write(content)
+            except OSError:
+                path.unlink(missing_ok=True)
+                raise
     except OSError as error:
         raise ExportError(f"{path} cannot be written: {error.strerror}") from None
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def check_new(path: Path) -> None:
