@@ -132,7 +132,7 @@ class _Lesson:
         """Return what is played now, for a person."""
         spec, value = self._spec, self.value(env_steps)
         if value is not None:
-            shown = short_number(value) if isinstance(value, float) else str(value)
+            shown = f"{value:.4g}" if isinstance(value, float) else str(value)
             if spec.steps is not None and self.state.step < len(spec.steps):
                 return f"{shown} (step {self.state.step + 1} of {len(spec.steps) + 1})"
             if spec.until_env_steps is not None and env_steps < spec.until_env_steps:
@@ -143,7 +143,7 @@ class _Lesson:
         weights = self._weights()
         if max(weights) > 1.5 / len(weights):
             low, high = self._ranges[int(np.argmax(weights))]
-            often = short_number(low) if low == high else f"{short_number(low)} to {short_number(high)}"
+            often = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
             text += f" (most often {often})"
         return text
 
