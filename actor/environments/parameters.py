@@ -119,11 +119,11 @@ class WithParameters(gymnasium.Wrapper):
         except EnvironmentSetupError:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
-            changed = [name for name, value in given.items() if self._set.get(name) != value]
+            changed = next(name for name, value in given.items() if self._set.get(name) != value)
             print_traceback(error)
             raise EnvironmentSetupError(
                 f"environment {self._name}: {what} raises {first_line(error)}{place_of(error)}: if it refuses a value, "
-                f"change {' or '.join(f'environment.parameters.{name}' for name in changed[:1])} or [lessons]"
+                f"change lessons.{changed} or environment.parameters.{changed}"
             ) from None
 
     def _unknown(self, name: str, known: Any, reason: str) -> EnvironmentSetupError:

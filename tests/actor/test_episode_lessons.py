@@ -1,5 +1,7 @@
 """Parameters that the learner sets: how actors apply, draw and acknowledge them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
@@ -16,7 +18,7 @@ from daedalus.protocol.uploads import Rollout
 LESSONS = {"stones": LessonSpec(between=(1, 5))}
 
 
-def path(name: str = "Path", **more: object) -> EnvironmentSpec:
+def path(name: str = "Path", **more: Any) -> EnvironmentSpec:
     values = {"id": f"lesson_environment:{name}", "kwargs": {"always_opens": True}, "parameters": {"stones": 7}}
     return EnvironmentSpec.model_validate({**values, **more})
 
@@ -33,8 +35,8 @@ def played(rollout: Rollout) -> list[int]:
 
 
 @pytest.mark.parametrize("more", [{}, {"id": "lesson_environment:PathWithMethod"}, {"processes": True}])
-def test_each_episode_has_the_parameter_that_its_rollout_acknowledges(more: dict[str, object]) -> None:
-    options = {"count": 3, "rollout_length": 40, "lessons": LESSONS, "plan": plan((1, 2), (5, 5))}
+def test_each_episode_has_the_parameter_that_its_rollout_acknowledges(more: dict[str, Any]) -> None:
+    options: dict[str, Any] = {"count": 3, "rollout_length": 40, "lessons": LESSONS, "plan": plan((1, 2), (5, 5))}
     collector = started_collector(path(**more), PlainPolicy(), **options)
     first = played(collect(collector))
     assert set(first) == {1, 2, 5}
