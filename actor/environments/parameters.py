@@ -107,8 +107,8 @@ class WithParameters(gymnasium.Wrapper):
         result = self._call(f"reset with the options {shown}", given, lambda: self.env.reset(seed=seed, options=noted))
         if isinstance(noted, ReadOptions):
             for unread in (name for name in given if name not in noted.read):
-                others = sorted(noted.read - given.keys())
-                found = f"reset reads {', '.join(others)} of its options" if others else "reset reads none such"
+                others = sorted(noted.read)
+                found = f"reset reads {', '.join(others)} of its options" if others else "reset reads no option"
                 raise self._unknown(unread, others, f"{found}, and the environment has no method {_METHOD}")
         self._set, self._first = given, False
         return result
