@@ -9,10 +9,12 @@ from collectors import collect, snapshot, started_collector
 from plain import PlainPolicy
 
 from daedalus.actor.checking.play import check_environment
+from daedalus.actor.collecting.client_rows import check_run
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.errors import ActorError
 from daedalus.protocol.lessons import LessonPlan, LessonRange, LessonSpec
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.uploads import Rollout
 
 LESSONS = {"stones": LessonSpec(between=(1, 5))}
@@ -128,3 +130,11 @@ def test_environments_that_share_a_vector_entry_point_are_made_one_by_one() -> N
     rollout = collect(collector)
     assert ((rollout.lessons["low"] > -0.2) & (rollout.lessons["low"] < -0.1)).all()
     assert len(set(rollout.lessons["high"].tolist())) == len(rollout.episode_returns) > 1
+
+
+def test_clients_and_older_actors_refuse_a_run_with_lessons() -> None:
+    """A client's environment is its own; an older actor finds settings in `changed` that it does not know."""
+    spec = RunSpec(environment=path(), lessons=LESSONS).for_actors()
+    assert {"environment.parameters", "lessons"} <= set(spec.changed)
+    with pytest.raises(ActorError, match="this run has lessons for stones, and a client's own loop makes its"):
+        check_run(spec)

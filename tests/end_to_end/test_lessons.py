@@ -45,7 +45,7 @@ def test_actors_on_two_hosts_learn_a_task_by_lessons_and_a_host_that_refuses_the
     assert refused.wait() == 1
     reason = "reset with the options stones=30 raises AssertionError: at most 9 stones fit here"
     assert reason in refused.lines[-1]
-    central.start("status", "--connect", address).expect("refused: refusing .* environment lessons:Path: reset with")
+    central.start("status", "--connect", address).expect("refused: refusing .*, 1 x, ")
 
     actors = [host.start("actor", "--connect", address, "--name", host.name, *ALLOWED) for host in hosts]
     learner.expect("lesson stones: 2 ")
