@@ -97,7 +97,7 @@ class EnvironmentCollector:
             _logger.info("%s", line)
 
     def _games(self, spec: ActorSpec, count: int) -> GameEnvironments:
-        return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league))
+        return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league, count))
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. The environments are reset when the first snapshot is loaded, which may carry lessons."""
