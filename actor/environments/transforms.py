@@ -21,9 +21,11 @@ from daedalus.actor.environments.components import (
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.games import GameEnvironments
+from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
 from daedalus.actor.environments.info import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed, Step
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, ObservationSpaces, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -355,6 +357,11 @@ class TransformedEnvironment:
                 ignored[0],
             )
         return np.where(resets, 0.0, rewards)
+
+    def set_parameters(self, parameters: Mapping[int, Parameters]) -> None:
+        """See VectorEnvironment."""
+        assert isinstance(self._environments, GymnasiumEnvironments)  # no other backend has parameters
+        self._environments.set_parameters(parameters)
 
     @property
     def agents(self) -> tuple[str, ...]:
