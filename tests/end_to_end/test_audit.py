@@ -24,12 +24,13 @@ def test_the_audit_hook_ends_a_process_that_unpickles() -> None:
 def test_training_resuming_and_evaluating_unpickle_nothing(start: Callable[..., Running], tmp_path: Path) -> None:
     saving = ("--set", "service.checkpoint_seconds=0.2", "--set", "evaluation.seconds=0.2")
     few = ("--actors", 1, "--set", "evaluation.episodes=2", "--set", "evaluation.final_episodes=2")
+    few = (*few, "--set", "environment.max_episode_steps=20")
     first = start("train", "cartpole", *ENDLESS, *SLOW, "--run-dir", "run", *saving, *few)
     first.expect("evaluation at")
     first.process.terminate()
     assert first.wait() == 1, first.output
     env_steps = json.loads((tmp_path / "run" / "summary.json").read_text())["env_steps"]
-    again = start("resume", "run", "--env-steps", env_steps + 300, *PLAYING_SLOW)
+    again = start("resume", "run", "--env-steps", env_steps + 100, *PLAYING_SLOW)
     assert again.wait() in (0, 3), again.output
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["evaluation_return_mean"] > 5
     assert (tmp_path / "run" / "checkpoints").is_dir()

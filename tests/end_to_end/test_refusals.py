@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from plain import vector_spaces
-from processes import Running, free_address, starting, until
+from processes import LIMIT, Running, free_address, starting, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -38,7 +38,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Transport]:
 
 
 def ask(transport: Transport, key: str, payload: bytes) -> Message:
-    (answer,) = transport.query(key, payload, timeout=30.0)
+    (answer,) = transport.query(key, payload, timeout=LIMIT)
     return decode(answer, Limits())
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
-from processes import ENDLESS, SLOW, Running, listening_ports, processes_mentioning, starting, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, listening_ports, processes_mentioning, starting, until
 from trackers import wandb_run
 
 from daedalus.launch.evaluation import evaluate
@@ -204,7 +204,7 @@ def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ende
     running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS, *SLOW)
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
-    second = start("resume", "orphan-run")
+    second = start("resume", "orphan-run", *PLAYING_SLOW)
     assert second.wait() == 1
     assert second.lines == [
         f"daedalus resume: run directory orphan-run is in use by process {running.process.pid} on "
