@@ -77,6 +77,13 @@ def policy_files(record: RunRecord, policy: SavedPolicy, repository: str) -> dic
                 f"{name} holds a password or a token, which would be published: train without it in the settings (let "
                 "the environment read it from a variable), and push that run"
             )
+    if folders := [name for name in policy.spec.league.opponents if Path(name).is_dir()]:
+        _logger.warning(
+            "league.opponents names folders of this machine, and their names become public in %s and %s: %s",
+            CONFIG,
+            METRICS,
+            ", ".join(folders),
+        )
     with private_folder() as folder:
         exported = Path(folder) / "policy"
         export_policy(policy.directory, exported)

@@ -1,4 +1,4 @@
-"""Make the pictures of the page that the documentation shows, from a short run of CartPole: `make screenshots`.
+"""Make the pictures of the page that the documentation shows, from short runs: `make screenshots`.
 
 It needs Debian's chromium and playwright (the extra `browser`).
 """
@@ -29,16 +29,17 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("docs/images"), help="folder (default: %(default)s)")
     parsed = parser.parse_args()
     parsed.output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        words = [*COMMAND, "train", "cartpole", "--watch", "--run-dir", "cartpole-impala-s1", *SETTINGS]
-        run = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
-        try:
-            address = page_address(run)
-            token = (Path(folder) / "cartpole-impala-s1" / "operator-token").read_text().strip()
-            _take(address, token, parsed.output, parsed.seconds)
-        finally:
-            run.terminate()
-            run.wait()
+    for preset, settings, take in (("cartpole", SETTINGS, _take), ("connect_four", [], _take_match)):
+        with tempfile.TemporaryDirectory() as folder:
+            words = [*COMMAND, "train", preset, "--watch", "--run-dir", f"{preset}-s1", *settings]
+            run = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
+            try:
+                address = page_address(run)
+                token = (Path(folder) / f"{preset}-s1" / "operator-token").read_text().strip()
+                take(address, token, parsed.output, parsed.seconds)
+            finally:
+                run.terminate()
+                run.wait()
 
 
 def page_address(run: subprocess.Popen[str]) -> str:
@@ -76,6 +77,26 @@ def _take(address: str, token: str, folder: Path, seconds: float) -> None:
         light.locator("#camera").scroll_into_view_if_needed()
         light.locator("#camera").screenshot(path=str(folder / "page_camera.png"))
         _shrink(folder / "page_camera.png")
+        browser.close()
+
+
+def _take_match(address: str, token: str, folder: Path, seconds: float) -> None:
+    """Play some moves against the policy of a run that has trained for a while."""
+    sync_api: Any = importlib.import_module("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 620, "height": 720}, color_scheme="light")
+        page.wait_for_timeout(1000 * seconds)
+        page.goto(f"{address}match")
+        page.locator("#token").fill(token)
+        page.get_by_role("button", name="Open").click()
+        page.get_by_role("button", name="Begin a match").click(timeout=LIMIT)
+        for column in (3, 2, 4, 3, 2):
+            page.wait_for_selector("#board [aria-disabled=false]", timeout=LIMIT)
+            page.locator(f"#board [aria-disabled=false]:nth-child(7n+{column + 1})").first.click()
+            page.wait_for_timeout(1000)
+        page.screenshot(path=str(folder / "page_match.png"))
+        _shrink(folder / "page_match.png")
         browser.close()
 
 

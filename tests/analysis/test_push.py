@@ -26,9 +26,11 @@ from daedalus.policy.saving import hub as hub_module
 from daedalus.policy.saving.hub import HubError, pull
 from daedalus.policy.saving.saved_policy import find_policy, read_policy
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.protocol.spec import EnvironmentSpec
 
 pytest.importorskip("huggingface_hub")
 pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=<...>' to upload:DeprecationWarning")  # in huggingface_hub
+GAME = EnvironmentSpec(id="pettingzoo.classic.tictactoe_v3", backend="pettingzoo")
 POLICY = {"manifest.json", "seal", "program.onnx", "parameters.safetensors"}
 
 
@@ -467,12 +469,14 @@ def test_a_changed_file_is_damaged(hub: HubServer, file: str) -> None:
         find_policy(pull("ada/cart"))
 
 
-def test_a_large_video_is_left_out(
+def test_a_large_video_is_left_out_and_folders_of_this_machine_are_named(
     hub: HubServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    run = run_of(Path("run"), 4)
+    Path("older").mkdir()
+    run = save(run_of(Path("run"), 3), GAME, 4, league={"opponents": {"random": 0.0, "older": 0.0}})
     (run / "replay.mp4").write_bytes(b"a video")
     monkeypatch.setattr(hub_upload, "_MAX_VIDEO_BYTES", 3)
     with caplog.at_level(logging.WARNING):
         assert push(["run", "ada/cart"]) == 0
     assert "replay.mp4" not in hub.files("ada/cart")
+    assert "names become public in config.toml and metrics.csv: older" in caplog.text
