@@ -47,6 +47,7 @@ def test_a_client_is_trained_on_in_nested_spaces_with_masks(start: Start, addres
         observation_space=robot.observation_space,
         action_space=robot.action_space,
         action_mask=info["action_mask"],
+        timeout=LIMIT,
     ) as client:
         while not client.is_over:
             assert time.monotonic() < deadline, learner.output

@@ -18,7 +18,7 @@ from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
 SIZES = ("collection.actors=1", "collection.envs_per_actor=2", "collection.rollout_length=8", "training.minibatches=1")
-TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=5")
+TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=1")
 WORDS = [word for each in (*SIZES, *TARGET) for word in ("--set", each)]
 
 

@@ -154,12 +154,12 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
-    small = ("--actors", 1, "--set", "evaluation.final_episodes=2", "--log", "wandb")
+    small = ("--actors", 1, "--set", "evaluation.final_episodes=1", "--log", "wandb")
     first = start("train", "cartpole", "--env-steps", 4000, "--run-dir", "run", *small)
     assert first.wait() == 3, first.output  # the budget ended without the target
     first.expect("wandb: recorded offline; upload the run with: wandb sync .*/run/wandb/offline-run-")
     tracked = wandb_run(tmp_path / "run")
-    assert tracked["summary"]["summary/evaluation.episodes"] == 2
+    assert tracked["summary"]["summary/evaluation.episodes"] == 1
     before = newest_checkpoint(tmp_path / "run")
     rows, end = metrics(tmp_path / "run"), summary(tmp_path / "run")
 
@@ -171,12 +171,12 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
     assert newest_checkpoint(tmp_path / "run") == before
     assert (metrics(tmp_path / "run"), summary(tmp_path / "run")) == (rows, end)
 
-    changed = ("--set", "training.learning_rate_final=0.0001", "--set", "evaluation.final_episodes=3")
+    changed = ("--set", "training.learning_rate_final=0.0001", "--set", "evaluation.final_episodes=2")
     further = start("resume", "run", "--env-steps", 12000, *changed)
     assert further.wait() == 3, further.output
     result = summary(tmp_path / "run")
     assert result["env_steps"] >= 12000
-    assert result["evaluation"]["episodes"] == 3
+    assert result["evaluation"]["episodes"] == 2
     assert int(newest_checkpoint(tmp_path / "run").name) == result["updates"] > int(before.name)
     rows = metrics(tmp_path / "run")
     assert [int(row["env_steps"]) for row in rows] == sorted(int(row["env_steps"]) for row in rows)
@@ -185,7 +185,7 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
     assert again["id"] == tracked["id"]
     assert again["config"]["training"]["learning_rate_final"] == 0.0001
     assert max(again["history"]) == result["env_steps"] > max(tracked["history"])
-    assert again["summary"]["summary/evaluation.episodes"] == 3
+    assert again["summary"]["summary/evaluation.episodes"] == 2
 
 
 def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: Path) -> None:
