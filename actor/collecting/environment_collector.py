@@ -91,7 +91,7 @@ class EnvironmentCollector:
             _logger.info("%s", line)
 
     def _games(self, spec: ActorSpec, count: int) -> GameEnvironments:
-        return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league))
+        return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league, count))
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Reset the environments."""

@@ -336,12 +336,12 @@ class SeatWriter(RolloutWriter):
         if len(self._deciding):
             choice = self._runtime.act(inputs.observations, inputs.state, inputs.noise, inputs.masks, inputs.epsilon)
             self.take_choice(choice)
-        self._lineup.act(self._acting, self._stacks, self._current_masks, self._chosen)
+        self._lineup.act(self._acting & ~self._episodes.ended, self._stacks, self._current_masks, self._chosen)
         return self._chosen
 
     def begin_row(self) -> RowInputs:
         """See RolloutWriter. The inputs are those of the acting seats of the newest policy."""
-        seats = self._deciding = np.flatnonzero(self._acting & self._lineup.is_newest)
+        seats = self._deciding = (self._acting & self._lineup.is_newest).nonzero()[0]
         columns = self._lineup.column[seats]
         learned = columns >= 0
         if not learned.all():
@@ -375,11 +375,15 @@ class SeatWriter(RolloutWriter):
         """
         copies = np.zeros(len(self._over), np.bool_)
         copies[written // self._seats] = True
-        if self._lineup.has_opponents:
-            columns = self._lineup.column.reshape(-1, self._seats)
-            learned = (columns >= 0) & (self._rows[columns] < len(self._rewards))
-            others = (self._acting & ~self._lineup.is_newest).reshape(-1, self._seats).any(axis=1)
-            copies |= learned.any(axis=1) & others & ~self._over
+        if opposed := self._lineup.against_opponents:
+            first = opposed.start * self._seats
+            learned = self._rows[first:] < len(self._rewards)
+            if len(learned) > len(opposed):
+                learned = learned.reshape(len(opposed), -1).any(axis=1)
+            learned &= ~self._over[opposed.start : opposed.stop]
+            others = (self._acting & (self._lineup.column < 0))[first : opposed.stop * self._seats].nonzero()[0]
+            others //= self._seats
+            copies[opposed.start + others[learned[others]]] = True
         return int(np.count_nonzero(copies))
 
     def take_choice(self, choice: Choice) -> None:
@@ -406,7 +410,7 @@ class SeatWriter(RolloutWriter):
         self._take_seats(observed)
         resets = self._episodes.ended
         # A column may go on with another seat after a row that resets.
-        seats = np.flatnonzero(observed.acting & (self._lineup.column >= 0))
+        seats = (observed.acting & (self._lineup.column >= 0)).nonzero()[0]
         columns = self._lineup.column[seats]
         written = self._writing[columns]
         seats, columns = seats[written], columns[written]
@@ -426,7 +430,7 @@ class SeatWriter(RolloutWriter):
         self._show(observed)
         rewards = rewards.astype(np.float32)
         counted = self._lineup.column >= 0
-        abandoned = self._lineup.step(rewards, np.flatnonzero(observed.over & ~was_over).tolist())
+        abandoned = self._lineup.step(rewards, (observed.over & ~was_over).nonzero()[0].tolist())
         # Also those that are not written: the agents who act most often would have too few results in the mean.
         self._episodes.step_seats(observed.acting, rewards, terminated | truncated, counted)
         for copy in abandoned:

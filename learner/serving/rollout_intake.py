@@ -397,15 +397,12 @@ class RolloutIntake:
             request.reply(encode(replace(answer, policy_version=self._published_version())))
 
     def _decide(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
-        if self._is_surplus(content):
-            content = Rejected(
-                verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor, or is full"
-            )
-        if not isinstance(content, Rejected):
+        surplus = self._is_surplus(content)
+        if not isinstance(content, Rejected) and not surplus:
             self._buffer.heard(sender)
-        verdict = self._judge.decide(sender, content, self._version, time.monotonic())
+        verdict = self._judge.decide(sender, content, self._version, time.monotonic(), surplus=surplus)
         self._fleet.received(sender, size)
-        if not isinstance(verdict, Rejected) or verdict.cause == "stale":
+        if not isinstance(verdict, Rejected) or verdict.cause in ("stale", "surplus"):
             self._count_matches(content)
         if isinstance(verdict, Rejected):
             self._count_rejection(sender, verdict)
@@ -416,7 +413,7 @@ class RolloutIntake:
         return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
 
     def _count_matches(self, content: Upload | Rejected) -> None:
-        """Count the results of matches in a rollout that was received for the first time, however old its policy is."""
+        """Count the results of matches in a rollout that was received for the first time, even if not learned from."""
         if self._league is not None and isinstance(content, Rollout) and content.matches is not None:
             self._league.add(content.matches)
 

@@ -139,7 +139,9 @@ class RolloutJudge:
         violation = self._first_violation(upload, spaces, actor)
         return Rejected(verdict="rejected", cause="unfit", reason=violation) if violation else upload
 
-    def decide(self, sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
+    def decide(
+        self, sender: str, content: Upload | Rejected, policy_version: int, now: float, *, surplus: bool = False
+    ) -> Upload | Rejected:
         """Decide on a result of `read`, count the verdict, and return it. The caller holds the lock.
 
         Args:
@@ -147,8 +149,14 @@ class RolloutJudge:
           content: result of `read`.
           policy_version: newest policy version; the policy lag is relative to it.
           now: time on the monotonic clock, in seconds.
+          surplus: whether the batch has no room for a rollout of this actor.
         """
-        verdict = content if isinstance(content, Rejected) else self._judge(sender, content, policy_version, now)
+        verdict = content
+        if not isinstance(content, Rejected):
+            verdict = self._judge(sender, content, policy_version, now)
+        if surplus and not isinstance(verdict, Rejected):
+            reason = "the batch already has a rollout of this actor, or is full"
+            verdict = Rejected(verdict="rejected", cause="surplus", reason=reason)
         actor = self._fleet.actors.get(sender)
         if actor is not None:
             actor.heard(now)
@@ -218,7 +226,7 @@ class RolloutJudge:
         rows = self._spec.collection.rollout_length * min(upload.identity.sequence + 1, _LOST * (actor.uploads + 1))
         if actor.environments == 1 or self._spec.algorithm.synchronous or self._spec.environment.is_game:
             rows += int(_CLIENT_ROWS * (now - actor.joined + _BEGIN_SECONDS))
-        if actor.matches + matches > rows * (actor.environments + 1):  # one copy of the game may only rate
+        if actor.matches + matches > rows * 2 * actor.environments:  # as many copies of the game may only rate
             return f"it reports {matches} matches, and {actor.matches} before, but has played at most {rows} rows"
         longest, total = int(lengths.max(initial=0)), sum(lengths.tolist())
         if longest > rows or actor.episode_rows + total > rows * actor.environments:
