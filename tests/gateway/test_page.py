@@ -16,7 +16,7 @@ from browser import AXE, Visit, chromium
 from certificates import make_certificates
 from gateways import RunningGateway
 from league_statuses import LEAGUE
-from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, starting, until
+from processes import LIMIT, Running, starting, until
 from scripted_learner import SPEC, ScriptedLearner, acknowledge
 from watched import HOSTILE, actor_status, observed, run_status
 
@@ -36,6 +36,7 @@ FOLDER = FolderView(
     settings=(("environment.id", HOSTILE, True), ("training.discount_factor", "0.99", False)), output=HOSTILE
 )
 TOKEN = "an operator's token of some length"
+ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 Open = Callable[..., Visit]
 
 
@@ -107,8 +108,7 @@ class Run:
 def run(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[tuple[Run, Callable[..., Running]]]:
     """A run, and a function that starts further commands. Asking for the browser first skips without one."""
     with starting(tmp_path_factory.mktemp("watched")) as start:
-        words = ("--watch", "--clients", "--run-dir", "run", "--actors", 1)
-        process = start("train", "cartpole", *words, *ENDLESS, *SLOW)
+        process = start("train", "cartpole", "--watch", "--clients", "--run-dir", "run", "--actors", 1, *ENDLESS)
         yield Run(process), start
 
 
@@ -119,7 +119,7 @@ def test_curves_appear_and_a_killed_actor_shows_as_gone(run: tuple[Run, Callable
     wait_for(page, "document.querySelectorAll('#charts .line').length >= 5")
     wait_for(page, "document.querySelector('#state').textContent === 'running'")
     assert text_of(page, "#run") == "run"
-    actor = start("actor", "--connect", watched.learner, "--name", "fragile", *PLAYING_SLOW)
+    actor = start("actor", "--connect", watched.learner, "--name", "fragile")
     row = "tr:has(td:text-is('fragile'))"
     page.wait_for_selector(f"{row}[data-state='alive']", timeout=MILLISECONDS)
     actor.process.send_signal(signal.SIGKILL)
