@@ -170,12 +170,6 @@ class ChildOutput:
         with self._reading(name, self._show) as streams:
             yield streams
 
-    def unshown(self, name: str) -> list[str]:
-        """Return the newest error lines of a process that were not shown. Call it after the end of the process."""
-        self._wait(self._readers.get(name, []))
-        with self._lock:
-            return list(self._unshown.get(name, ()))
-
     def last_error(self, name: str) -> str:
         """Return the last line of standard error of a process, or an empty string. Call it after the process's end.
 

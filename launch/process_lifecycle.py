@@ -35,6 +35,7 @@ _LEAVE = getattr(signal, "SIGUSR1", None)  # Windows has none
 _STUCK_SECONDS = 4.0  # in one call after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
 _THREADS_SECONDS = 1.0  # for threads that are not ours, at the end
+_REPEAT_SECONDS = 0.05  # after an interrupt that was dropped
 _LAST_WORD_SECONDS = 0.5  # for a last line that may block
 _TRACEBACK_SECONDS = 5.0  # for a traceback that may block
 _LONGEST_LINE = 1 << 16  # bytes, from the parent
@@ -246,7 +247,7 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     before = set(threading.enumerate())
     try:
         try:
-            with _interrupts_recognised():
+            with _lost_interrupts_repeated(), _interrupts_recognised():
                 return _ended(command(), before)
         finally:
             sys.stdout.flush()
@@ -320,6 +321,37 @@ def _interrupts_recognised() -> Iterator[None]:
     finally:
         if signal.getsignal(signal.SIGINT) is handle:  # the command has no handlers of its own
             signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextlib.contextmanager
+def _lost_interrupts_repeated() -> Iterator[None]:
+    """Repeat an interrupt whose KeyboardInterrupt Python has dropped, as it does in callbacks of weak references.
+
+    The import system has such callbacks, and a command imports for seconds before it has handlers of its own.
+    """
+    others = sys.unraisablehook
+
+    def repeat() -> None:
+        raising = signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+        number = signal.SIGTERM if raising else signal.SIGINT  # which may be ignored
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, number)  # which ends its wait
+        else:  # Windows
+            signal.raise_signal(number)
+
+    def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if isinstance(dropped.exc_value, KeyboardInterrupt):
+            later = threading.Timer(_REPEAT_SECONDS, repeat)  # in the hook it would be dropped again
+            later.daemon = True
+            later.start()
+        else:
+            others(dropped)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = others
 
 
 def discard(*streams: TextIO) -> None:

@@ -1,5 +1,6 @@
 """Fixtures for tests with processes."""
 
+import gc
 import json
 import os
 import sys
@@ -50,6 +51,11 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_collectstart() -> None:
     """Keep bytecode also after the import of a module that asks for none, as a game of PettingZoo does."""
     sys.dont_write_bytecode = False
+
+
+def pytest_collection_finish() -> None:
+    """Leave the modules and the collected tests out of garbage collections, each of which would look at all of them."""
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

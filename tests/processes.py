@@ -3,6 +3,7 @@
 import itertools
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -14,6 +15,13 @@ from pathlib import Path
 
 DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 LIMIT = 300.0  # seconds; timeout of each step, long enough for a slow machine with much other work
+ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+# CartPole whose steps wait: a run that goes on while a test waits for something else leaves it the processor.
+SLOW = (
+    *("--set", "environment.id=slow_environment:Slow-v0", "--set", "environment.processes=false"),
+    *("--set", "collection.envs_per_actor=2", "--set", "collection.rollout_length=16"),
+)
+PLAYING_SLOW = ("--allow-module", "slow_environment")  # of its actors
 _first_port = 20_000 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 10 * 1000
 _port_numbers = itertools.count(os.getpid())  # another run of the tests begins elsewhere
 
@@ -79,6 +87,7 @@ class Running:
 @contextmanager
 def starting(folder: Path) -> Iterator[Callable[..., Running]]:
     """Give a function that starts `daedalus ARGUMENTS` in the folder. Processes left are killed at the end."""
+    shutil.copy(Path(__file__).parent / "slow_environment.py", folder)
     running: list[Running] = []
 
     def start(*arguments: object, directory: Path = folder, command: list[str] = DAEDALUS) -> Running:

@@ -33,7 +33,7 @@ from daedalus.policy.saving.saved_policy import find_policy, pretrained
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
-BUDGET = {"env_steps": 5_000, "actors": 1, "settings": {"evaluation.final_episodes": 3, "policy.hidden": [16]}}
+BUDGET = {"env_steps": 5_000, "actors": 1, "settings": {"evaluation.final_episodes": 1, "policy.hidden": [16]}}
 
 
 def test_importing_daedalus_loads_no_other_package() -> None:
@@ -118,7 +118,7 @@ def test_a_callback_logs_metrics_and_ends_training(tmp_path: Path) -> None:
         def on_end(self, run: daedalus.TrainingRun) -> None:
             self.calls.append("end")
 
-    settings = {"evaluation.final_episodes": 3, "service.log_seconds": 0.1}
+    settings = {"evaluation.final_episodes": 1, "service.log_seconds": 0.1}
     arguments = {"env_steps": 10**9, "actors": 1, "run_dir": tmp_path / "run", "quiet": True, "settings": settings}
     result = daedalus.train(env="CartPole-v1", **arguments, callback=Watch())
     assert (result.stop_reason, result.finished, result.exit_status) == ("it came back", False, 0)

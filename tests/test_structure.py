@@ -49,6 +49,16 @@ def imported(tree: ast.Module) -> set[str]:
     return names
 
 
+def dotted(node: ast.expr) -> str:
+    """Return a name such as `os.path.join`, or an empty string for another expression."""
+    names = []
+    while isinstance(node, ast.Attribute):
+        names.append(node.attr)
+        node = node.value
+    return ".".join([node.id, *reversed(names)]) if isinstance(node, ast.Name) else ""
+
+
+@functools.cache
 def called(tree: ast.Module) -> set[str]:
     """Return the whole names of the functions that are called, whatever name they were imported by."""
     whole: dict[str, str] = {}
@@ -60,7 +70,7 @@ def called(tree: ast.Module) -> set[str]:
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
-            first, dot, rest = ast.unparse(node.func).partition(".")
+            first, dot, rest = dotted(node.func).partition(".")
             found.add(whole.get(first, first) + dot + rest)
     return found
 

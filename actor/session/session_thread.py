@@ -112,10 +112,6 @@ class SessionThread:
         except TransportError:
             answered(None, time.monotonic())
 
-    def locked(self) -> threading.Condition:
-        """Return the lock of the conversation."""
-        return self._changed
-
     def _note(self, event: Callable[..., None], *arguments: Any) -> None:
         with self._changed:
             event(*arguments)

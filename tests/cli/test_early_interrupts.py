@@ -59,17 +59,35 @@ def test_ctrl_c_before_the_handlers_stops_the_process_in_order(
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
-# In place of a command without handlers: Ctrl-C arrives in code that replaces KeyboardInterrupt, as pydantic does.
-REPLACING = """
-import signal, sys, types
+# In place of a command without handlers: Ctrl-C arrives in code that replaces KeyboardInterrupt, as pydantic does, or a
+# signal arrives in a callback whose exceptions Python drops, as those of the import system.
+RAISING = """
+import signal, sys, time, types, weakref
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores SIGINT in jobs of its background
 from daedalus.cli import main
 
-def build(_arguments):
+def replacing():
     try:
         signal.raise_signal(signal.SIGINT)
     except KeyboardInterrupt as error:
         raise ValueError("cannot build the validator") from error
+
+def dropping():
+    held = {"an object"}
+    weak = weakref.ref(held, lambda _: signal.raise_signal(signal.SIGINT))
+    del held
+    time.sleep(1000)
+
+def dropping_in_the_background():
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as train, resume and sweep do
+    held = {"an object"}
+    weak = weakref.ref(held, lambda _: signal.raise_signal(signal.SIGTERM))
+    del held
+    time.sleep(1000)
+
+def build(_arguments):
+    BUILD()
 
 main.COMMANDS["plot"] = types.SimpleNamespace(function="build", run=build)
 sys.argv[1:] = ["plot"]
@@ -77,10 +95,10 @@ sys.exit(main.main())
 """
 
 
-def test_ctrl_c_that_a_library_replaces_by_its_own_exception_shows_no_traceback() -> None:
-    ended = subprocess.run(
-        [sys.executable, "-c", REPLACING], capture_output=True, text=True, timeout=SECONDS, check=False
-    )
+@pytest.mark.parametrize("build", ["replacing", "dropping", "dropping_in_the_background"])
+def test_an_interrupt_that_is_replaced_by_another_exception_or_dropped_ends_the_command(build: str) -> None:
+    words = [sys.executable, "-c", RAISING.replace("BUILD", build)]
+    ended = subprocess.run(words, capture_output=True, text=True, timeout=SECONDS, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", "stopped\n")
 
 

@@ -192,9 +192,8 @@ def test_default_settings_leave_out_a_text_that_never_changes() -> None:
         assert spaces is not None
         assert list(spaces.observations) == ["step"]
         assert defaults["environment"]["leave_out"] == ["mission"]
-        assert LINES.pop() == (
-            "observation component 'mission' is left out (environment.leave_out): it is always 'open the door'"
-        )
+    line = "observation component 'mission' is left out (environment.leave_out): it is always 'open the door'"
+    assert LINES.count(line) == 2
 
 
 def test_settings_of_a_preset_must_leave_out_a_text_themselves() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import Running
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running
 
 
 @pytest.fixture(autouse=True)
@@ -24,11 +24,14 @@ def test_the_audit_hook_ends_a_process_that_unpickles() -> None:
 def test_training_resuming_and_evaluating_unpickle_nothing(start: Callable[..., Running], tmp_path: Path) -> None:
     saving = ("--set", "service.checkpoint_seconds=0.2", "--set", "evaluation.seconds=0.2")
     few = ("--actors", 1, "--set", "evaluation.episodes=2", "--set", "evaluation.final_episodes=2")
-    first = start("train", "cartpole", "--env-steps", 60_000, "--run-dir", "run", *saving, *few)
-    assert first.wait() in (0, 3), first.output
-    again = start("resume", "run", "--env-steps", 120_000)
+    few = (*few, "--set", "environment.max_episode_steps=20")
+    first = start("train", "cartpole", *ENDLESS, *SLOW, "--run-dir", "run", *saving, *few)
+    first.expect("evaluation at")
+    first.process.terminate()
+    assert first.wait() == 1, first.output
+    env_steps = json.loads((tmp_path / "run" / "summary.json").read_text())["env_steps"]
+    again = start("resume", "run", "--env-steps", env_steps + 100, *PLAYING_SLOW)
     assert again.wait() in (0, 3), again.output
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["evaluation_return_mean"] > 5
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["evaluation_return_mean"] > 5
     assert (tmp_path / "run" / "checkpoints").is_dir()
     assert "UNPICKLED" not in first.output + again.output

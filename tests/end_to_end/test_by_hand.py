@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 from learner_status import env_steps, learner_status
-from processes import Running, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
 
 Start = Callable[..., Running]
 LOGGED = ("--log", "wandb")
-ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 
 
 def test_an_actor_that_starts_before_the_learner_waits_for_it(
@@ -20,7 +19,7 @@ def test_an_actor_that_starts_before_the_learner_waits_for_it(
     monkeypatch.setenv("WANDB_MODE", "offline")
     actor = start("actor", "--connect", address, "--name", "early")
     actor.expect("waiting for it")
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 30000, *LOGGED)
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 8000, *LOGGED)
     actor.expect("joined run 'run' as 'early': 128 x CartPole-v1")
     assert learner.wait() == 3, learner.output
     assert actor.wait() == 0, actor.output
@@ -39,21 +38,21 @@ def test_an_actor_that_starts_before_the_learner_waits_for_it(
 def test_an_actor_loads_no_torch_and_uses_little_memory_and_another_that_joins_late_is_trained_on(
     start: Start, address: str
 ) -> None:
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
-    first = start("actor", "--connect", address, "--name", "first")
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS, *SLOW)
+    first = start("actor", "--connect", address, "--name", "first", *PLAYING_SLOW)
     learner.expect(r"updates .*/s")
     maps = Path(f"/proc/{first.process.pid}/maps").read_text()
     assert "onnxruntime" in maps
     assert "libtorch" not in maps
     status = Path(f"/proc/{first.process.pid}/status").read_text()
     assert int(re.search(r"VmRSS:\s+(\d+)", status)[1]) <= 150 * 1024  # type: ignore[index]
-    start("actor", "--connect", address, "--name", "late", "--envs", 8, "--runtime", "torch")
+    start("actor", "--connect", address, "--name", "late", "--envs", 3, "--runtime", "torch", *PLAYING_SLOW)
     until(lambda: env_steps(learner_status(address), "late") > 0)
-    start("status", "--connect", address, "--events").expect("joined  *late  *joined with 8 environments")
+    start("status", "--connect", address, "--events").expect("joined  *late  *joined with 3 environments")
     asked = start("status", "--connect", address, "--json")
     assert asked.wait() == 0
-    report = json.loads(asked.output)
-    assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 128, "late": 8}
+    report = json.loads(asked.lines[-1])
+    assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 2, "late": 3}
     learner.process.terminate()
     assert learner.wait() == 0
 

@@ -44,7 +44,7 @@ import sys
 
 import daedalus
 
-SETTINGS = {"evaluation.final_episodes": 4, "policy.hidden": [16], "service.log_seconds": 0.2}
+SETTINGS = {"evaluation.final_episodes": 1, "policy.hidden": [16], "service.log_seconds": 0.2}
 FEW = {"actors": 2, "settings": {**SETTINGS, "collection.rollout_length": 16}, "quiet": True}
 
 

@@ -1,7 +1,5 @@
 """Test of failures of actors, learner, router, disk and network, with real processes."""
 
-import json
-import os
 import random
 import resource
 import signal
@@ -12,13 +10,12 @@ from pathlib import Path
 import pytest
 from faults import Sender, StallingProxy
 from learner_status import actor_status, env_steps, learner_status
-from processes import LIMIT, Running, processes_mentioning, until
+from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, until
 
 from daedalus.protocol import keys
 
 Start = Callable[..., Running]
 Status = Callable[[], dict]
-ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 SAVING = ("--set", "service.checkpoint_seconds=0.3")
 
 
@@ -31,7 +28,8 @@ def status(address: str) -> Status:
 @pytest.fixture
 def learner(start: Start, address: str) -> Callable[..., Running]:
     """Function that starts a learner with an endless run."""
-    return lambda *more: start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS, *more)
+    words = ("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
+    return lambda *more: start(*words, *SLOW, *more)
 
 
 def wait_for_training(status: Status, name: str) -> None:
@@ -48,8 +46,8 @@ def test_a_frozen_actor_is_noticed_as_gone_nobody_waits_for_it_and_it_continues_
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     learner("--algorithm", "a2c")  # whose batches have a rollout of each actor
-    frozen = start("actor", "--connect", address, "--name", "frozen")
-    start("actor", "--connect", address, "--name", "other")
+    frozen = start("actor", "--connect", address, "--name", "frozen", *PLAYING_SLOW)
+    start("actor", "--connect", address, "--name", "other", *PLAYING_SLOW)
     wait_for_training(status, "frozen")
     frozen.process.send_signal(signal.SIGSTOP)
     try:
@@ -68,7 +66,7 @@ def test_an_actor_continues_without_a_restart_after_its_link_stalled(
 ) -> None:
     learner()
     with closing(StallingProxy(address)) as proxy:
-        start("actor", "--connect", proxy.address, "--name", "remote")
+        start("actor", "--connect", proxy.address, "--name", "remote", *PLAYING_SLOW)
         wait_for_training(status, "remote")
         proxy.stall()
         until(lambda: actor_status(status(), "remote").get("alive") is False)
@@ -112,33 +110,11 @@ def newest_checkpoint(directory: Path) -> str:
     return max((entry.name for entry in (directory / "checkpoints").glob("0*")), default="")
 
 
-def learners(run: str) -> list[int]:
-    """Return the ids of learner processes of a run that `daedalus train` started."""
-    return sorted(set(processes_mentioning("--prepared")) & set(processes_mentioning(run)))
-
-
-def test_a_killed_learner_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
-    settings = (*ENDLESS[:2], *SAVING, "--set", "evaluation.final_episodes=3")
-    training = start("train", "cartpole", "--run-dir", "fallen-run", "--env-steps", 400_000, *settings)
-    until(lambda: newest_checkpoint(tmp_path / "fallen-run"))
-    (victim,) = learners("fallen-run")
-    os.kill(victim, signal.SIGKILL)
-    assert training.wait() in (0, 3), training.output
-    assert training.output.count("the learner was killed by signal 9; started again") == 1
-    assert training.output.count("resuming from checkpoint") == 1
-    assert "Traceback" not in training.output
-    summary = json.loads((tmp_path / "fallen-run" / "summary.json").read_text())
-    assert summary["env_steps"] >= 400_000
-    address = training.expect(r"at (unixsock-stream/\S+);").group(1)
-    assert not processes_mentioning("fallen-run")
-    assert not processes_mentioning(address)
-
-
 def test_the_same_command_with_resume_continues_a_killed_learner(
     start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     first = learner("--resume", *SAVING)
-    start("actor", "--connect", address, "--name", "loyal")
+    start("actor", "--connect", address, "--name", "loyal", *PLAYING_SLOW)
     wait_for_training(status, "loyal")
     until(lambda: int(newest_checkpoint(tmp_path / "run") or 0) > 0)  # not only that of the first weights
     first.process.kill()
@@ -157,7 +133,7 @@ def test_a_learner_writes_its_summary_on_sigterm_although_an_actor_is_frozen(
     start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     leaving = learner()
-    frozen = start("actor", "--connect", address, "--name", "frozen")
+    frozen = start("actor", "--connect", address, "--name", "frozen", *PLAYING_SLOW)
     wait_for_training(status, "frozen")
     frozen.process.send_signal(signal.SIGSTOP)
     leaving.process.terminate()
@@ -184,10 +160,10 @@ def router(start: Start, address: str) -> Callable[[], Running]:
 def test_learner_and_actors_reconnect_when_the_router_is_restarted(
     start: Start, address: str, status: Status, router: Callable[[], Running]
 ) -> None:
-    serving = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS)
+    serving = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS, *SLOW)
     serving.expect("waiting for it")
     first = router()
-    actor = start("actor", "--connect", address, "--name", "loyal")
+    actor = start("actor", "--connect", address, "--name", "loyal", *PLAYING_SLOW)
     wait_for_training(status, "loyal")
     first.process.kill()
     first.wait()
@@ -203,8 +179,8 @@ def test_a_learner_serves_again_after_its_link_to_the_router_stalled(
 ) -> None:
     router()
     with closing(StallingProxy(address)) as proxy:
-        start("learner", "cartpole", "--connect", proxy.address, "--run-dir", "run", *ENDLESS)
-        start("actor", "--connect", address, "--name", "loyal")
+        start("learner", "cartpole", "--connect", proxy.address, "--run-dir", "run", *ENDLESS, *SLOW)
+        start("actor", "--connect", address, "--name", "loyal", *PLAYING_SLOW)
         wait_for_training(status, "loyal")
         proxy.stall()
         until(lambda: status() == {})
@@ -219,7 +195,7 @@ def test_arbitrary_bytes_on_any_key_change_nothing(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     serving = learner()
-    actor = start("actor", "--connect", address, "--name", "good")
+    actor = start("actor", "--connect", address, "--name", "good", *PLAYING_SLOW)
     wait_for_training(status, "good")
     run = status()["run"]
     sender = Sender(address, "stranger")
@@ -263,11 +239,12 @@ def test_arbitrary_bytes_on_any_key_change_nothing(
 
 
 def test_a_flooded_learner_answers_busy_and_trains_on_every_accepted_rollout(
-    start: Start, address: str, status: Status, learner: Callable[..., Running]
+    start: Start, address: str, status: Status
 ) -> None:
     """Send a thousand rollouts at once to a queue that holds some hundred, while an actor plays."""
-    learner("--set", "service.queue_megabytes=0.2", "--set", "training.max_policy_lag=1000000")
-    start("actor", "--connect", address, "--name", "good")
+    small = ("--set", "service.queue_megabytes=0.2", "--set", "training.max_policy_lag=1000000")
+    start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS, *small)
+    start("actor", "--connect", address, "--name", "good", "--envs", 2)
     wait_for_training(status, "good")
     sender = Sender(address, "flood")
     verdicts: list[bytes | None] = []
@@ -296,7 +273,7 @@ def test_training_continues_with_a_warning_while_no_checkpoint_can_be_saved(
     start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     serving = learner(*SAVING)
-    start("actor", "--connect", address, "--name", "good")
+    start("actor", "--connect", address, "--name", "good", *PLAYING_SLOW)
     wait_for_training(status, "good")
     until(lambda: status().get("checkpoint_age_seconds") is not None)
     _, hard = resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE)

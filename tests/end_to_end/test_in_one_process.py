@@ -116,7 +116,7 @@ def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, alg
 
 SETTINGS = ("training.env_steps=24000", "training.stop_when_solved=false")
 NORMALIZATION = (
-    "evaluation.final_episodes=10",
+    "evaluation.final_episodes=1",
     "policy.normalize_observations=true",
     "training.normalize_rewards=true",
     "training.normalize_advantages=true",
@@ -133,7 +133,7 @@ def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
 
 
 def checkpoint_files(directory: Path) -> dict[str, bytes]:
-    (checkpoint,) = (directory / "checkpoints").iterdir()
+    checkpoint = max((directory / "checkpoints").iterdir())  # a slow run has saved earlier ones
     return {entry.name: entry.read_bytes() for entry in checkpoint.iterdir() if entry.suffix == ".safetensors"}
 
 

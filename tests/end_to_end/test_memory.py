@@ -67,4 +67,4 @@ def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint(start: Start
     assert float(f"{best_score(best):.6g}") >= max(float(row["evaluation_return_mean"]) for row in evaluated)
     played = start("evaluate", "run", "--episodes", 1, "--json")
     assert played.wait() == 0, played.output
-    assert json.loads(played.output)["best_checkpoint"]
+    assert json.loads(played.lines[-1])["best_checkpoint"]

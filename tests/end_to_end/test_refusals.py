@@ -1,7 +1,6 @@
 """Test of a real learner with mismatching actors and with arbitrary bytes."""
 
 import re
-import shutil
 import socket
 import struct
 from collections.abc import Callable, Iterator
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from plain import vector_spaces
-from processes import Running, free_address, starting, until
+from processes import LIMIT, Running, free_address, starting, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -39,7 +38,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Transport]:
 
 
 def ask(transport: Transport, key: str, payload: bytes) -> Message:
-    (answer,) = transport.query(key, payload, timeout=30.0)
+    (answer,) = transport.query(key, payload, timeout=LIMIT)
     return decode(answer, Limits())
 
 
@@ -68,10 +67,7 @@ def test_a_foreign_join_that_comes_first_does_not_decide_the_spaces(client: Tran
     assert isinstance(ask(client, keys.join("*", "client"), join(spaces=CARTPOLE, environments=2)), Welcome)
 
 
-def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(
-    start: Start, address: str, tmp_path: Path
-) -> None:
-    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
+def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(start: Start, address: str) -> None:
     slow = ("--set", "environment.kwargs.seconds=0.1", "--set", "collection.envs_per_actor=1")
     learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run", *slow)
     learner.expect("actors join with")
@@ -100,9 +96,10 @@ def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str)
 
 
 def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_the_reason(
-    start: Start, address: str
+    start: Start, address: str, tmp_path: Path
 ) -> None:
     """The module is not in the learner's folder: the first actor decides the spaces."""
+    (tmp_path / "slow_environment.py").unlink()
     learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run")
     learner.expect("the first actor decides the spaces of the run, because .* cannot import slow_environment")
     learner.expect("actors join with")

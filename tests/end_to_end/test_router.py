@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from certificates import make_certificates
-from processes import Running, free_address, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, until
 from prometheus_client.parser import text_string_to_metric_families
 
 from daedalus.cli.command_table import COMMANDS
@@ -35,7 +35,7 @@ def test_a_router_prints_its_address_and_ends_on_sigterm(start: Start, address: 
 def test_a_run_works_over_two_routers_that_start_in_any_order(start: Start, address: str, other_address: str) -> None:
     second = start("router", "--listen", other_address, "--connect", address)
     second.expect(f"nothing answers at {address}: .*; trying again")
-    learner = start("learner", "cartpole", "--connect", other_address, "--run-dir", "run", "--env-steps", 30000)
+    learner = start("learner", "cartpole", "--connect", other_address, "--run-dir", "run", "--env-steps", 8000)
     start("actor", "--connect", address)
     start("router", "--listen", address)
     assert learner.wait() == 3, learner.output
@@ -92,9 +92,6 @@ def test_an_insecure_address_is_bad_usage(
     assert message in capsys.readouterr().err
 
 
-ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-
-
 def scrape(url: str) -> dict[tuple[str, str], float]:
     """Return the values by the names of sample and actor."""
     with urllib.request.urlopen(url, timeout=60) as answer:
@@ -107,8 +104,8 @@ def test_the_exporter_serves_metrics_of_the_present_learner_and_actors_only(star
     url = exporter.expect(r"http://\S+").group()
     assert scrape(url) == {("daedalus_up", ""): 0.0}
     start("router", "--listen", address)
-    learner = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS)
-    actors = {name: start("actor", "--connect", address, "--name", name, "--envs", 4) for name in ("a", "b")}
+    learner = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS, *SLOW)
+    actors = {name: start("actor", "--connect", address, "--name", name, *PLAYING_SLOW) for name in ("a", "b")}
     env_steps = "daedalus_actor_env_steps_total"
     until(lambda: all(scrape(url).get((env_steps, name), 0.0) > 0.0 for name in actors))
     samples = scrape(url)

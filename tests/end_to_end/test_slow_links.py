@@ -1,14 +1,12 @@
 """Actors on a slow link, and with slow environments."""
 
-import shutil
 from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 from faults import SlowProxy
 from learner_status import actor_status, learner_status
-from processes import Running, until
+from processes import ENDLESS, PLAYING_SLOW, Running, until
 
 Start = Callable[..., Running]
 
@@ -16,8 +14,7 @@ Start = Callable[..., Running]
 @pytest.fixture
 def far(start: Start, address: str) -> Callable[[], dict]:
     """Start a learner with an endless run; return a function for the status of the actor `far`."""
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-    start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
+    start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
 
     return lambda: actor_status(learner_status(address), "far")
 
@@ -47,17 +44,13 @@ def test_an_actor_with_link_wan_keeps_receiving_new_weights(
     assert sum(report["rollouts_rejected"].values()) < report["rollouts_accepted"]
 
 
-def test_slow_actors_wait_for_a_stopped_learner_and_leave_a_finished_run(
-    start: Start, address: str, tmp_path: Path
-) -> None:
-    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
+def test_slow_actors_wait_for_a_stopped_learner_and_leave_a_finished_run(start: Start, address: str) -> None:
     # An actor's rollout of 64 env_steps takes 0.26 s.
     sizes = ("collection.envs_per_actor=2", "collection.rollout_length=32", "service.log_seconds=0.1")
     settings = [word for each in sizes for word in ("--set", each)]
     words = ("learner", "--env", "slow_environment:Slow-v0", "--listen", address, *settings, "--run-dir", "run")
-    allowing = ("--allow-module", "slow_environment")
     learner = start(*words, "--env-steps", 10**9)
-    actors = [start("actor", "--connect", address, "--name", name, *allowing) for name in ("a", "b")]
+    actors = [start("actor", "--connect", address, "--name", name, *PLAYING_SLOW) for name in ("a", "b")]
     for actor in actors:
         actor.expect("joined run")
     learner.expect(r"updates .*/s")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from processes import Running, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -26,13 +26,12 @@ def test_an_actor_that_stays_serves_the_next_run_until_it_is_drained(
 ) -> None:
     router = start("router", "--listen", address)
     router.expect("listening")
-    actor = start("actor", "--connect", address, "--name", "standing", "--envs", 8, "--stay")
+    actor = start("actor", "--connect", address, "--name", "standing", "--envs", 8, "--stay", *PLAYING_SLOW)
     first = start("learner", "cartpole", "--connect", address, "--run-dir", "first", "--env-steps", 3000)
     actor.expect("joined run 'first'")
     assert first.wait() == 3, first.output
     actor.expect("waiting for the next run")
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-    second = start("learner", "cartpole", "--connect", address, "--run-dir", "second", *endless)
+    second = start("learner", "cartpole", "--connect", address, "--run-dir", "second", *ENDLESS, *SLOW)
     actor.expect("joined run 'second'")
     second.expect(r"updates .*/s")
     start("actor", "--connect", address, "--name", "idle", "--run", "third", "--stay")
@@ -69,11 +68,10 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
     """The older learner is cut off from the router while the copy starts, and returns."""
     start("router", "--listen", address).expect("listening")
     learner = ("learner", "cartpole", "--connect", address, "--resume", "--run-dir")
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-    often = (*endless, "--set", "service.checkpoint_seconds=0.2")
+    often = (*ENDLESS, *SLOW, "--set", "service.checkpoint_seconds=0.2")
     older = start(*learner, "one/sb", *often)
-    actors = [start("actor", "--connect", address, "--name", "leaves", "--envs", 4)]
-    actors.append(start("actor", "--connect", address, "--name", "stays", "--envs", 4, "--run", "sb", "--stay"))
+    actors = [start("actor", "--connect", address, "--name", "leaves", "--envs", 4, *PLAYING_SLOW)]
+    actors.append(start("actor", "--connect", address, "--name", "stays", "--run", "sb", "--stay", *PLAYING_SLOW))
     older.expect("joined with 4 environments")
     until(lambda: list((tmp_path / "one/sb/checkpoints").glob("0*")))
     os.kill(older.process.pid, signal.SIGSTOP)
@@ -105,7 +103,6 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
 def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release(
     start: Start, address: str, tmp_path: Path
 ) -> None:
-    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
     with closing(listen([address])):
         actor = start("actor", "--connect", address, "--name", "standing", "--envs", 4, "--stay")
         newer = bytearray(encode(Refusal(code="not_ready", reason="")))

@@ -78,7 +78,7 @@ def trained(actors: int, upload: str, env_steps: int) -> tuple[Any, float]:
 def test_actors_lag_by_the_updates_of_the_others_and_play_at_the_same_time(upload: str) -> None:
     seconds = {}
     for actors in (1, 4):
-        learner, seconds[actors] = trained(actors, upload, 4000)
+        learner, seconds[actors] = trained(actors, upload, 2000)
         counters = learner.counters
         assert counters.policy_lag_mean == pytest.approx(actors - 1, abs=0.2)
         rollouts = counters.rollouts_trained

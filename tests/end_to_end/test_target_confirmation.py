@@ -18,7 +18,7 @@ from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
 SIZES = ("collection.actors=1", "collection.envs_per_actor=2", "collection.rollout_length=8", "training.minibatches=1")
-TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=5")
+TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=1")
 WORDS = [word for each in (*SIZES, *TARGET) for word in ("--set", each)]
 
 
@@ -111,14 +111,21 @@ def test_run_that_is_stopped_during_the_confirmation_is_not_solved_and_resumes(
     assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
 
 
-def test_learner_that_crashes_during_the_confirmation_asks_again(train: Callable[..., Running], tmp_path: Path) -> None:
+def test_evaluator_and_then_learner_that_are_killed_during_the_confirmation_play_and_ask_again(
+    train: Callable[..., Running], tmp_path: Path
+) -> None:
     (tmp_path / WAITING).touch()
     running = train()
     running.expect("target 1 reached: ")
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
-    (victim,) = set(processes_mentioning("commands.learner")) & set(processes_mentioning(address))
     until(lambda: players(tmp_path))
+    (victim,) = players(tmp_path)
+    os.kill(victim, signal.SIGKILL)
+    running.expect("confirmation was killed by signal 9; started again")
+    until(lambda: set(players(tmp_path)) - {victim})
+    assert running.output.count("target 1 reached: ") == 1
     (orphan,) = players(tmp_path)
+    (victim,) = set(processes_mentioning("commands.learner")) & set(processes_mentioning(address))
     os.kill(victim, signal.SIGKILL)
     until(lambda: running.output.count("target 1 reached: ") == 2)
     until(lambda: orphan not in players(tmp_path))
@@ -127,20 +134,3 @@ def test_learner_that_crashes_during_the_confirmation_asks_again(train: Callable
     result = summary(tmp_path)
     assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
     assert result["confirmation"]["policy_version"] == result["updates"]
-
-
-def test_evaluator_that_is_killed_during_the_confirmation_plays_again(
-    train: Callable[..., Running], tmp_path: Path
-) -> None:
-    (tmp_path / WAITING).touch()
-    running = train()
-    running.expect("target 1 reached: ")
-    until(lambda: players(tmp_path))
-    (victim,) = players(tmp_path)
-    os.kill(victim, signal.SIGKILL)
-    running.expect("confirmation was killed by signal 9; started again")
-    (tmp_path / WAITING).unlink()
-    assert running.wait() == 0, running.output
-    result = summary(tmp_path)
-    assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
-    assert len([each for each in read_events(tmp_path / "run") if each.kind == "target"]) == 1

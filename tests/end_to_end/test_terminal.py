@@ -129,7 +129,7 @@ def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
 
 
 def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Callable[..., AtTerminal]) -> None:
-    short = ("--env-steps", "20000", "--set", "evaluation.final_episodes=3", "--actors", "1")
+    short = ("--env-steps", "4000", "--set", "evaluation.final_episodes=1", "--actors", "1")
     running = at_terminal("train", "cartpole", "--watch", "--run-dir", "kept-run", *short)
     until(lambda: running.fault or "press Ctrl-C to close it" in running.text.replace("\n", ""))
     assert "report: kept-run/report.html" in running.text

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from certificates import change_certificates, make_certificates
-from processes import Running, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
 
 Start = Callable[..., Running]
 
@@ -24,13 +24,13 @@ def tls(address: str) -> str:
 def test_authorised_actors_of_other_machines_join_train_over_tls_until_an_operator_stops_it(
     start: Start, tls: str, certificates: Path, tmp_path: Path
 ) -> None:
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-    training = ("--listen", tls, "--tls", certificates / "learner", "--actors", 1, *endless)
+    training = ("--listen", tls, "--tls", certificates / "learner", "--actors", 1, *ENDLESS, *SLOW)
     train = start("train", "cartpole", *training)
     train.expect("return .* actors 1")
-    arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
+    arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm", *PLAYING_SLOW)
     arm.expect(r"joined run .* as 'arm\.[\w-]+-\d+'")
-    start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box").expect("as 'box'")
+    box = ("--connect", tls, "--tls", certificates / "actor-box", "--name", "box")
+    start("actor", *box, *PLAYING_SLOW).expect("as 'box'")
     train.expect("actors 3")
     asking = ("status", "--connect", tls, "--quiet", "--tls")
     assert start(*asking, certificates / "actor-arm").wait() == 2
@@ -48,13 +48,12 @@ def test_authorised_actors_of_other_machines_join_train_over_tls_until_an_operat
 
 
 def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls: str, certificates: Path) -> None:
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     router = start("router", "--listen", tls, "--tls", certificates / "router")
     router.expect("listening")
-    learner = start("learner", "cartpole", "--connect", tls, "--tls", certificates / "learner", *endless)
+    learner = start("learner", "cartpole", "--connect", tls, "--tls", certificates / "learner", *ENDLESS, *SLOW)
     shutil.copytree(certificates / "actor-arm", certificates / "kept")
-    arm = start("actor", "--connect", tls, "--tls", certificates / "kept")
-    box = start("actor", "--connect", tls, "--tls", certificates / "actor-box")
+    arm = start("actor", "--connect", tls, "--tls", certificates / "kept", *PLAYING_SLOW)
+    box = start("actor", "--connect", tls, "--tls", certificates / "actor-box", *PLAYING_SLOW)
     for actor in (arm, box):
         actor.expect("joined run")
     change_certificates(certificates, "revoke actor arm")
@@ -63,7 +62,7 @@ def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls
     change_certificates(certificates, "issue actor late")
     router.expect("2 actors and 1 operators are authorised; all connections are renewed")
     trained = len(learner.lines)
-    start("actor", "--connect", tls, "--tls", certificates / "actor-late").expect("joined run")
+    start("actor", "--connect", tls, "--tls", certificates / "actor-late", *PLAYING_SLOW).expect("joined run")
     until(lambda: any("actors 2" in line for line in learner.lines[trained:]))
     assert [each.process.poll() for each in (router, learner, box)] == [None] * 3
 
@@ -105,9 +104,8 @@ def test_users_of_one_router_are_kept_apart(start: Start, tls: str, tmp_path: Pa
     refused = start("learner", "cartpole", "--run-dir", "bob", *to, folder / "learner-alice")
     assert refused.wait() == 2
     refused.expect("is not for the run 'bob', only for 'alice'")
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-    learner = start("learner", "cartpole", "--run-dir", "alice", *endless, *to, folder / "learner-alice")
-    start("actor", *to, folder / "actor-arm").expect("joined run 'alice'")
+    learner = start("learner", "cartpole", "--run-dir", "alice", *ENDLESS, *SLOW, *to, folder / "learner-alice")
+    start("actor", *to, folder / "actor-arm", *PLAYING_SLOW).expect("joined run 'alice'")
     learner.expect("actors 1")
     until(lambda: start("status", "--quiet", *to, folder / "operator-ann").wait() == 0)
     assert start("status", *to, folder / "operator-ben").wait() == 1

@@ -19,7 +19,7 @@ from daedalus.protocol.uploads import Rollout, RolloutIdentity
 LIMITS = Limits()
 PREFIX = struct.Struct("<4sHHI")
 DTYPES = ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8", "<f8")
-repeatable = settings(max_examples=60, deadline=None, derandomize=True)
+repeatable = settings(max_examples=40, deadline=None, derandomize=True)
 
 
 def wire(content: Any, body: bytes = b"", *, flags: int = 0, version: int = PROTOCOL_VERSION) -> bytes:

@@ -21,7 +21,7 @@ from daedalus.protocol.uploads import Rollout
 from .settings import draw
 from .simulate import services, simulate
 
-SEEDS = 100
+SEEDS = 60
 SEEDS_TO_FIND = 1000  # within which a break must be found
 ROOT = Path(__file__).parent.parent.parent
 
@@ -46,7 +46,7 @@ def digest(seed: int) -> str:
 def test_a_seed_repeats_exactly() -> None:
     """In another process too, in which sets have another order."""
     kinds = [next(seed for seed in range(1000) if getattr(draw(seed), kind)) for kind in ("fine", "real_codec")]
-    seeds = [*range(10), *kinds]
+    seeds = [*range(4), *kinds]
     here = [digest(seed) for seed in seeds]
     assert [digest(seed) for seed in seeds] == here
     code = f"""
