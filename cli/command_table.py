@@ -35,6 +35,7 @@ after training:
   plot       draw the learning curves of one or more runs
   compare    print a table of groups of runs, with intervals
   report     write one HTML file about one or more runs
+  export     write the policy of a run as one ONNX file, for use without Daedalus
   push       upload the policy of a run to the Hugging Face Hub
 
 for the shell:
@@ -71,7 +72,7 @@ COMMANDS = {
     "resume": Command("commands.train:resume_parser", "commands.train:resume"),
     "sweep": Command("commands.sweep:parser", "commands.sweep:sweep"),
     "check": Command("commands.check:parser", "commands.check:check"),
-    "settings": Command("commands.settings_command:parser", "commands.settings:settings"),
+    "settings": Command("commands.settings_command:parser", "commands.settings_command:settings"),
     "learner": Command("commands.learner:parser"),
     "actor": Command("commands.actor:parser"),
     "router": Command("commands.router:parser", "commands.router:router"),
@@ -86,6 +87,7 @@ COMMANDS = {
     "plot": Command("commands.plot:parser", "commands.plot:plot"),
     "compare": Command("commands.compare:parser", "commands.compare:compare"),
     "report": Command("commands.report:parser", "commands.report:report"),
+    "export": Command("commands.export:parser", "commands.export:export"),
     "push": Command("commands.push:parser", "commands.push:push"),
     "completion": Command("commands.completion:parser", "commands.completion:completion"),
 }

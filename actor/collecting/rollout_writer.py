@@ -256,11 +256,16 @@ class RolloutWriter:
         self.start(observed)
 
     def finish(
-        self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None
+        self,
+        identity: RolloutIdentity,
+        policy_version: int,
+        episode_info: dict[str, np.ndarray] | None = None,
+        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
         """Return the full rollout. Its arrays are views: encode or copy it before the next `act`.
 
-        `episode_info` is that of the environments (VectorEnvironment.take_episode_info).
+        `episode_info` is that of the environments (VectorEnvironment.take_episode_info), and `lessons` are the
+        parameters of the episodes that ended (EpisodeLessons.take_finished).
         """
         self._row = 0
         if self._reward_clip is not None:
@@ -287,6 +292,7 @@ class RolloutWriter:
             episode_returns=finished.returns[-self._rewards.size :],
             episode_lengths=finished.lengths[-self._rewards.size :],
             episode_info=episode_info or {},
+            lessons=lessons or {},
             overridden=self._overridden if self._overridden.any() else None,
         )
 
@@ -439,10 +445,14 @@ class SeatWriter(RolloutWriter):
         return bool((self._rows == len(self._rewards)).all())
 
     def finish(
-        self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None
+        self,
+        identity: RolloutIdentity,
+        policy_version: int,
+        episode_info: dict[str, np.ndarray] | None = None,
+        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
-        """See RolloutWriter."""
-        rollout = super().finish(identity, policy_version, episode_info)
+        """See RolloutWriter. No game has lessons."""
+        rollout = super().finish(identity, policy_version, episode_info, lessons)
         if not self._warned and self._skipped > self._rewards.size:
             self._warned = True
             _logger.warning(

@@ -168,7 +168,7 @@ class RolloutIntake:
         self._spec, self._lock = context.spec, context.lock
         self._fleet, self._counters, self._events = context.fleet, context.counters, context.events
         self._version = context.start_version  # rollouts of this version have a policy lag of 0
-        self._league = context.league
+        self._league, self._lessons = context.league, context.lessons
         self._judge = RolloutJudge(context.spec, context.learner_epoch, context.fleet, context.league)
         self._buffer = _buffer(context.spec, self._judge)
         self._requests = RequestQueue(context.spec.service.queue_bytes, _most_requests(context.spec, live=0))
@@ -326,6 +326,7 @@ class RolloutIntake:
             return
         updates = updates_of(self._spec.training, taken.rollouts, memory=self._judge.state_size > 0)
         self._counters.trained(taken.rollouts, version, updates)
+        self._lessons.add(taken.rollouts, self._counters.env_steps)
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
                 actors[rollout.identity.actor].env_steps += rollout.env_steps

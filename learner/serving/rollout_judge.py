@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from daedalus.learner.league.run_league import League
+from daedalus.learner.run.lesson_progress import lessons_violation
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.upload_checks import (
     Shapes,
@@ -262,19 +263,29 @@ class RolloutJudge:
         size = rows * row + 4 * self.state_size
         for space in spaces.observations.values():
             size += (rows + space.frames) * math.prod(space.shape) * np.dtype(space.dtype).itemsize
-        arrays = _OTHER_ARRAYS + len(spaces.observations) + 2 * len(spaces.actions) + MAX_INFO_NAMES
+        arrays = (
+            _OTHER_ARRAYS
+            + len(spaces.observations)
+            + 2 * len(spaces.actions)
+            + MAX_INFO_NAMES
+            + len(self._spec.lessons)
+        )
         return Limits(max_bytes=environments * size + _SLACK_BYTES, max_arrays=arrays)
 
     def _first_violation(self, rollout: Upload, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
         if isinstance(rollout, Gradient):
-            return gradient_violation(rollout, self._spec, self.gradient_shapes, spaces, actor.environments)
+            shapes = self.gradient_shapes
+            return gradient_violation(rollout, self._spec, shapes, spaces, actor.environments) or lessons_violation(
+                rollout, self._spec
+            )
         return (
             self._shape_violation(rollout, actor)
             or first_component_violation(rollout, spaces, self._spec.policy)
             or _number_violation(rollout)
             or self._value_violation(rollout)
             or _episode_violation(rollout)
+            or lessons_violation(rollout, self._spec)
         )
 
     def _shape_violation(self, rollout: Rollout, actor: Actor) -> str:
