@@ -23,7 +23,7 @@ FOLDERS = (
     "actor|algorithms|benchmarks|cli|daedalus|deploy|docs|examples|gateway|learner|policy|protocol|tests|transport"
 )
 ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
-FILE_ENDINGS = {"py", "ts", "md", "toml", "json"}
+FILE_ENDINGS = {"py", "ts", "md", "onnx", "toml", "json"}
 
 
 def anchor(heading: str) -> str:
