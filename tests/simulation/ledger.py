@@ -160,8 +160,10 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
     judge, buffer = server.rollouts._judge, server.rollouts._buffer
     decide, add, take = judge.decide, buffer.add, buffer.take
 
-    def noted_decide(sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
-        verdict = decide(sender, content, policy_version, now)
+    def noted_decide(
+        sender: str, content: Upload | Rejected, policy_version: int, now: float, *, surplus: bool = False
+    ) -> Upload | Rejected:
+        verdict = decide(sender, content, policy_version, now, surplus=surplus)
         if isinstance(content, Rollout):
             ledger.judged(life, content, verdict, server.context.fleet.actors[sender].incarnation)
         return verdict
