@@ -106,6 +106,7 @@ class LearnerService:
             if league is not None:
                 league.open(self._context.start_version)
             from daedalus.learner.training.learner import Learner
+            from daedalus.learner.training.replay_learner import ReplayLearner
 
             if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):
                 return self._stopped_without_actors()
@@ -115,7 +116,10 @@ class LearnerService:
             check_rollout_length(spec, spaces)
             if league is not None:
                 league.check_opponents(spaces)
-            learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
+            if spec.algorithm.replay:
+                learner: Learner = ReplayLearner(spec, spaces, self._beginning.modules)
+            else:
+                learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
             self._beginning.load_into(learner, spec, self._context.progress)
             checkpointer, loop = self._training_of(learner)
             if self._beginning.initial is not None:
