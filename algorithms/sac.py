@@ -4,6 +4,7 @@ The critics stay in the learner: the program and the snapshots of the actors are
 """
 
 import copy
+import itertools
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -34,7 +35,7 @@ class TwinCritics(nn.Module):
         self.encoder = build_encoder(spec.model_copy(update={"hidden": ()}), spaces.observations, modules)
         actions = sum(space.size for space in spaces.actions.values())
         sizes = [self.encoder.features + actions, *spec.hidden, 1]
-        pairs = list(zip(sizes, sizes[1:], strict=False))
+        pairs = list(itertools.pairwise(sizes))
         # As torch initialises linear layers; [2, inputs, outputs] and [2, 1, outputs].
         self.weights = nn.ParameterList([_uniform(inputs, (2, inputs, outputs)) for inputs, outputs in pairs])
         self.biases = nn.ParameterList([_uniform(inputs, (2, 1, outputs)) for inputs, outputs in pairs])

@@ -152,12 +152,23 @@ class LearnerService:
         from daedalus.learner.training_loop import TrainingLoop
 
         program = learner.program()
-        checkpointer = Checkpointer(self._context, learner, program)
+        checkpointer = Checkpointer(self._context, learner, program, *self._replay_saves(learner))
         loop = TrainingLoop(
             self._context, self._server, learner, checkpointer, self._confirmation, self._heartbeat.beat
         )
         loop.publish(program)
         return checkpointer, loop
+
+    def _replay_saves(self, learner: "Learner") -> "tuple[Callable[[], Callable[[], None]], ...]":
+        """Load the replay buffer of a resumed run, and return what saves it; empty where there is nothing to save."""
+        from daedalus.learner.training.replay_files import ReplayFiles
+        from daedalus.learner.training.replay_learner import ReplayLearner
+
+        if not (isinstance(learner, ReplayLearner) and self._context.spec.training.replay_saved):
+            return ()
+        files = ReplayFiles(self._context.directory, learner)
+        files.load()
+        return (files.begin,)
 
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer", loop: "TrainingLoop") -> Outcome:
         """Train, then write the last metrics row, checkpoint and summary, and let the actors leave."""

@@ -150,6 +150,9 @@ def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int)
 def _moved(transitions: Transitions, device: torch.device) -> Transitions:
     if device.type == "cpu":
         return transitions
+
+    def moved(values: Tensor) -> Tensor:
+        return values.to(device)
+
     observations, following, *others = transitions
-    moved = (map_components(each, lambda values: values.to(device)) for each in (observations, following))
-    return Transitions(*moved, *(values.to(device) for values in others))
+    return Transitions(map_components(observations, moved), map_components(following, moved), *map(moved, others))

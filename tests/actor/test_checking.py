@@ -300,6 +300,24 @@ def spec(**collection: object) -> RunSpec:
     )
 
 
+def test_slow_continuous_steps_suggest_sac() -> None:
+    arm, choice = ContinuousSpace(low=(-1.0,), high=(1.0,)), DiscreteSpace(counts=(2,))
+    free = ContinuousSpace(low=(None,), high=(None,))
+
+    def proposes(action: ContinuousSpace | DiscreteSpace, seconds: float, **training: Any) -> bool:
+        spaces = Spaces(observations={"o": ArraySpace(shape=(3,), dtype="float32")}, actions={"a": action})
+        policy = {"distribution": "squashed_gaussian", "state_dependent_std": True}
+        run = RunSpec.model_validate({"environment": {"id": "Any-v0"}, "policy": policy, "training": training})
+        found = advice(EnvironmentReport(spaces=spaces, step_seconds=seconds), run, processors=2)
+        return any("training.algorithm=sac" in text for text in found)
+
+    assert proposes(arm, 0.021)
+    assert not proposes(arm, 0.019)
+    assert not proposes(arm, 0.021, algorithm="sac")
+    assert not proposes(choice, 0.021)
+    assert not proposes(free, 0.021)
+
+
 def test_slow_steps_suggest_processes_where_they_help() -> None:
     waiting = EnvironmentReport(step_seconds=0.2, busy_share=0.0)
     busy = EnvironmentReport(step_seconds=0.2, busy_share=1.0)
