@@ -168,8 +168,8 @@ def replay_instead(report: EnvironmentReport, spec: RunSpec) -> str:
     if report.step_seconds <= _DEAR_SECONDS or not fits or spec.algorithm.replay or spec.environment.is_game:
         return ""
     return (
-        f"a step takes {_duration(report.step_seconds)}: training.algorithm=sac (--algorithm sac) learns from each step "
-        f"many times, and so needs far fewer of them than {spec.training.algorithm}"
+        f"a step takes {_duration(report.step_seconds)}: training.algorithm=sac (--algorithm sac) learns from each "
+        f"step many times, and so needs far fewer of them than {spec.training.algorithm}"
     )
 
 

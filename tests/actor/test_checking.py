@@ -27,7 +27,7 @@ from daedalus.actor.checking.play import check_environment, unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
 from daedalus.actor.environments.precision import Precision
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 FAULTY = "faulty_environments:Faulty-v0"
