@@ -87,8 +87,8 @@ class GradientComputer:
 
         The caller applies the gradient before it asks for the next update.
         """
-        # The statistics of observations do not change within a batch: normalise once for all passes.
-        batch = replace(batch, observations=self._network.normalizer(batch.observations))
+        # The statistics of observations do not change within a batch: prepare them once for all passes.
+        batch = replace(batch, observations=self._network.prepare(batch.observations))
         bonus = torch.tensor(entropy_bonus, device=batch.valid.device)
         for losses in self.algorithm.losses(batch, self.forward):
             if not isinstance(losses, Losses | MinibatchLosses):

@@ -477,11 +477,14 @@ class RewardNormalizer:
         seen = [self._returns.add(rollout, largest)[rollout.learned] for rollout in rollouts]
         return moments_of(torch.from_numpy(np.concatenate(seen)))
 
+    @property
+    def divisor(self) -> float:
+        """The number that rewards are divided by."""
+        return max(float(self.moments.variance.sqrt()), abs(float(self.moments.mean)) / _LARGEST_MEAN, 1e-8)
+
     def scale(self, batch: Batch) -> None:
         """Scale the rewards of a batch in place."""
-        deviation, mean = float(self.moments.variance.sqrt()), float(self.moments.mean)
-        divisor = max(deviation, abs(mean) / _LARGEST_MEAN, 1e-8)
-        batch.rewards.div_(divisor).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
+        batch.rewards.div_(self.divisor).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
 
     def reset(self) -> None:
         """Forget all returns."""

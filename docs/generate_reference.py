@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from daedalus.cli.command_table import COMMANDS
-from daedalus.cli.commands.settings import Setting, all_settings, sections
+from daedalus.cli.commands.settings_command import Setting, all_settings, sections
 
 ROOT = Path(__file__).parents[1]
 BEGIN, END = "<!-- generated -->", "<!-- end of generated -->"

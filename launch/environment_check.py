@@ -367,7 +367,10 @@ def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None
             spec.environment.id,
         )
     leave_out = [*spec.environment.leave_out, *report.constant_texts]
-    return report.spaces, default_settings(report.spaces, leave_out, report.seats)
+    for name, codes in report.codes.items():
+        shown = ",".join(map(str, codes))
+        _logger.info("observation component %r is read as codes (policy.codes.%s=[%s])", name, name, shown)
+    return report.spaces, default_settings(report.spaces, leave_out, report.seats, report.codes)
 
 
 def quick_check(

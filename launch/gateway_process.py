@@ -187,7 +187,7 @@ def _announce(token_file: Path | None) -> Callable[[str], None]:
 
 async def _serve(options: GatewayOptions, chosen: "_Chosen", listener: socket.socket, stop: threading.Event) -> None:
     # Imported here, because its packages are an extra.
-    from daedalus.gateway.service import GatewayService, GatewaySettings
+    from daedalus.gateway.gateway_service import GatewayService, GatewaySettings
 
     values = [] if options.run_directory is None else ["--checkpoints", str(options.run_directory)]
     settings = GatewaySettings(

@@ -4,6 +4,7 @@ The environment's nested spaces are flattened to components, and actions back (a
 """
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -33,6 +34,24 @@ def unfit_number(values: np.ndarray) -> str:
         return f"has a value that is not finite ({values[~np.isfinite(values)][0]})"
     beyond = low if low < -LARGEST_OBSERVATION else high
     return f"has a value beyond +-{LARGEST_OBSERVATION:g}: scale or clip the observations (it is {beyond:g})"
+
+
+def unfit_code(values: np.ndarray, codes: Sequence[int]) -> str:
+    """Return which value of an observation [..., C] is no code of its place in the last axis; empty if all are.
+
+    Args:
+      values: bytes of one component.
+      codes: how many codes each place has [C]; see policy.codes.
+    """
+    largest = values.max(axis=tuple(range(values.ndim - 1)), initial=0)
+    unknown = np.flatnonzero(largest >= np.array(codes))
+    if not len(unknown):
+        return ""
+    place = unknown[0]
+    return (
+        f"has the value {largest[place]} in place {place} of its last axis, but policy.codes has {codes[place]} codes "
+        "there: correct the environment, or start a run with higher numbers in policy.codes"
+    )
 
 
 ComponentName = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,64}$")]

@@ -29,6 +29,7 @@ from daedalus.protocol.texts import bounded_text, exact_number
 Backend = Literal["gymnasium", "envpool", "ale", "fast", "pettingzoo"]
 GAME_PACKAGES = ("pettingzoo", "mpe2")  # whose modules are games with several agents
 FrameStackSize = Annotated[int, Field(ge=1, le=16)]
+Codes = Annotated[tuple[Annotated[int, Field(ge=1, le=256)], ...], Field(min_length=1, max_length=256)]
 _OBJECT = r"\w+(\.\w+)*:\w+"  # module:name
 _Part = TypeVar("_Part", bound=Specification)
 _MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcome, and the names of the settings
@@ -161,18 +162,24 @@ class EnvironmentSpec(Specification):
 class PolicySpec(Specification):
     """Network: an encoder, an optional memory, then a policy head and a value head."""
 
-    encoder: Annotated[str, Field(pattern=rf"^(auto|mlp|small|nature|impala|article|{_OBJECT})$", max_length=200)] = (
-        "auto"
-    )
-    """Encoder of observations: `mlp`, `small`, `nature`, `impala`, `article`, or `module:Class` for your own. `auto`:
-    `nature` for images, `impala` for images smaller than 36 pixels, `mlp` for everything else."""
+    encoder: Annotated[
+        str, Field(pattern=rf"^(auto|mlp|grid|small|nature|impala|article|{_OBJECT})$", max_length=200)
+    ] = "auto"
+    """Encoder of observations: `mlp`, `grid`, `small`, `nature`, `impala`, `article`, or `module:Class` for your own.
+    `grid`: the `mlp` with a convolution before it, for small maps (height, width, planes). `auto`: `nature` for images,
+    `impala` for images smaller than 36 pixels, `mlp` for everything else."""
+    codes: dict[ComponentName, Codes] = Field(default_factory=dict)
+    """Components of bytes that are codes, such as kinds of things, and not quantities; each with how many codes there
+    are in each place of its last axis, or one number for all places: `image = [11, 6, 4]` in MiniGrid. The `mlp` and
+    `grid` encoders read a code as one-hot. Observations with a higher code are refused. Your own encoder receives the
+    bytes."""
     hidden: Annotated[tuple[PositiveInt, ...], Field(max_length=8)] = (64, 64)
-    """Units of each hidden layer; the `mlp` encoder only."""
+    """Units of each hidden layer; the `mlp` and `grid` encoders only."""
     activation: Literal["tanh", "relu"] = "tanh"
-    """Activation function; the `mlp` encoder only."""
+    """Activation function; the `mlp` and `grid` encoders only."""
     normalize_observations: bool = False
-    """Shift and scale observations to mean 0 and standard deviation 1, by running statistics. Bytes (`uint8`) that
-    an image encoder or your own encoder reads are left out."""
+    """Shift and scale observations to mean 0 and standard deviation 1, by running statistics. Codes, what a convolution
+    of the `grid` encoder reads, and bytes (`uint8`) that an image encoder or your own encoder reads are left out."""
     distribution: Annotated[
         str, Field(pattern=r"^(gaussian|squashed_gaussian|gaussian_mixture|kumaraswamy|[\w.]+:\w+)$", max_length=200)
     ] = "gaussian"
@@ -352,6 +359,10 @@ class TrainingSpec(LossSpec):
     """Rewards in the target of a transition before it bootstraps; fewer at the end of an episode or a rollout."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
+
+    curiosity: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    """Weight of a reward for each observation that is new in its episode, for goals that random actions hardly ever
+    reach; try 1. It falls linearly to 0 over the budget. 0: none. Observations must come back, as grids do."""
 
     optimizer: Literal["adam", "rmsprop"] = "adam"
     """Optimiser of the network's parameters."""
@@ -642,6 +653,20 @@ class RunSpec(Specification):
             raise ValueError(
                 f"training.normalize_rewards is true, but {name} keeps rewards for many updates, which need one scale: "
                 "set it to false, and environment.reward_scale if rewards are very large or small"
+            )
+        if self.training.curiosity:
+            raise ValueError(
+                f"training.curiosity is for algorithms that learn from new rollouts, but {name} learns from rewards in a "
+                "replay buffer, where they would not fade: set training.curiosity=0"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _curiosity_sees_rollouts(self) -> "RunSpec":
+        if self.uploads_gradients and self.training.curiosity:
+            raise ValueError(
+                "training.curiosity needs rollouts, and with collection.upload=gradients none reach the learner: "
+                "set collection.upload=rollouts, or training.curiosity=0"
             )
         return self
 

@@ -9,6 +9,7 @@ TEST_MODULES = UserModules(
             "corridor",
             "corridor_wrappers",
             "counting_environment",
+            "faulty_environments",
             "mission_environment",
             "nested_environment",
             "picture_environment",

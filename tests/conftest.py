@@ -8,6 +8,7 @@ from pathlib import Path
 
 import log_lines
 import pytest
+from _pytest.assertion import rewrite
 from hypothesis import Phase, settings
 from processes import Running, free_address, starting
 
@@ -27,6 +28,28 @@ settings.load_profile("daedalus")
 
 # Names in a module of tests that starts processes.
 STARTING = {"subprocess", "Running", "starting", "processes_mentioning", "installed", "nbclient"}
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Rewrite the assertions of a part of the test files, whose bytecode all workers then load.
+
+    All workers collect all files at the same time: on a new checkout each would rewrite all of them, which takes half
+    of the time of the collection.
+    """
+    worker, count = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0"))
+    if worker.startswith("gw"):
+        files = sorted((session.config.rootpath / "tests").rglob("test_*.py"))
+        for file in files[int(worker[2:]) % count :: count]:
+            folder = rewrite.get_cache_dir(file)
+            bytecode = folder / (file.stem + rewrite.PYC_TAIL)
+            if rewrite._read_pyc(file, bytecode) is None and rewrite.try_makedirs(folder):
+                source, code = rewrite._rewrite_test(file, session.config)
+                rewrite._write_pyc(session.config.stash[rewrite.assertstate_key], code, source, bytecode)
+
+
+def pytest_collectstart() -> None:
+    """Keep bytecode also after the import of a module that asks for none, as a game of PettingZoo does."""
+    sys.dont_write_bytecode = False
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -8,9 +8,8 @@ import numpy as np
 from plain import vector_spaces
 from processes import LIMIT
 
-from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.session.actor_config import ActorConfig, LinkChoice
-from daedalus.actor.session.actor_service import ActorService
+from daedalus.actor.session.actor_service import ActorService, Collector
 from daedalus.learner.serving.snapshot_publisher import CompactSnapshotCache
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash

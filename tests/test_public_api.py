@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from processes import LIMIT, Running, processes_mentioning, until
 from recorded_runs import record
 from saved_runs import CARTPOLE, COUNTING, save
@@ -27,7 +28,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.cli.commands.evaluate import main as evaluate_command
-from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.saved_policy import find_policy, pretrained
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
@@ -449,6 +450,25 @@ def test_stacked_frames_are_cleared_by_reset(tmp_path: Path) -> None:
     actions = [policy.act(observation) for observation in observations]
     policy.reset()
     assert [policy.act(observation) for observation in observations] == actions
+
+
+def test_observations_that_are_no_codes_are_refused(tmp_path: Path) -> None:
+    """A policy does not act on them, neither here nor in an evaluation."""
+    spec = EnvironmentSpec(id="faulty_environments:Faulty-v0", kwargs={"fault": "map", "value": 8})
+    save(tmp_path, spec, 1, policy={"codes": {"observation": (9,)}, "encoder": "mlp"})
+    policy = daedalus.load_policy(tmp_path, allow_modules=["faulty_environments"])
+    policy.act(np.full((20, 20), 8, np.uint8))
+    with pytest.raises(ValueError, match="component 'observation' of the observation has the value 9 in place 0"):
+        policy.act(np.full((20, 20), 9, np.uint8))
+    saved = find_policy(tmp_path)
+    runtime = OnnxRuntime(saved.program)
+    runtime.load(saved.weights)
+    other = spec.model_copy(update={"kwargs": {"fault": "map", "value": 9}})
+    with (
+        closing(make_environments(other, 2, modules=TEST_MODULES, one_episode=True)) as environments,
+        pytest.raises(PolicyError, match=r"has a value that is not among policy\.codes"),
+    ):
+        play_episodes(runtime, environments, 1, 1, sampled=False)
 
 
 @pytest.mark.parametrize("sampled", [False, True])

@@ -100,7 +100,7 @@ def test_no_file_uses_a_function_that_executes_its_input(package: str) -> None:
 
 
 DATING = {
-    *("tensorboard_writer.py", "mlflow_tracker.py", "logs.py", "events.py", "run_directory.py"),
+    *("tensorboard_writer.py", "known_trackers.py", "logs.py", "events.py", "run_directory.py"),
     *("certificates.py", "certificate_expiry.py", "security.py"),  # valid until a date
 }
 

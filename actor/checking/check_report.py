@@ -29,7 +29,9 @@ class EnvironmentReport(Specification):
     reset_seconds: float = 0.0  # mean
     vectorized: bool = False  # training plays it by a vector entry point of its own
     time_limit: int | None = None  # at which gymnasium truncates episodes
-    pixel_maxima: dict[str, int] = Field(default_factory=dict)  # largest value seen in each image, by component
+    # Largest values seen in arrays of bytes, by component: in each place of the last axis, or in all places.
+    byte_maxima: dict[str, tuple[int, ...]] = Field(default_factory=dict)
+    codes: dict[str, tuple[int, ...]] = Field(default_factory=dict)  # of components that are codes, as policy.codes
     lengths: tuple[int, ...] = ()  # of the episodes that ended
     returns: tuple[float, ...] = ()
 
@@ -50,7 +52,7 @@ def advice(report: EnvironmentReport, spec: RunSpec, processors: int) -> list[st
         f"{slow}; use --set environment.processes=true" if slow else "",
         float_images(report, spec),
         stacked_images(report, spec),
-        small_pixels(report, spec),
+        small_bytes(report, spec),
         uninformative_bounds(report),
         replay_instead(report, spec),
     )
@@ -126,20 +128,32 @@ def _is_shape_of_image(shape: tuple[int, ...]) -> bool:
     return ArraySpace(shape=shape, dtype="uint8").is_image
 
 
-def small_pixels(report: EnvironmentReport, spec: RunSpec) -> str:
-    """Return advice if an image has only small values, which the division by 255 makes nearly equal; else nothing."""
+def small_bytes(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if an array of bytes has only small values, which may be codes; else an empty string."""
     policy = spec.policy
-    if ":" in policy.encoder or (policy.encoder == "mlp" and policy.normalize_observations):
+    if ":" in policy.encoder or report.spaces is None:
         return ""
-    for name, largest in report.pixel_maxima.items():
-        if 0 < largest < _SMALL_PIXEL:
-            encoder = "" if policy.encoder == "mlp" else " --set policy.encoder=mlp"
-            normalized = "" if policy.normalize_observations else " --set policy.normalize_observations=true"
-            return (
-                f"{name!r} has no value above {largest}, and the encoder divides bytes by 255: if it is a map of small "
-                f"numbers, multiply it in a wrapper (--wrap), or use{encoder}{normalized}"
-            )
+    for name, maxima in report.byte_maxima.items():
+        space, largest = report.spaces.observations.get(name), max(maxima)
+        if not isinstance(space, ArraySpace) or name in {*policy.codes, *report.codes}:
+            continue
+        if not 0 < largest < _SMALL_PIXEL or (largest == 1 and not space.is_image):
+            continue
+        codes = "[" + ",".join(str(value + 1) for value in maxima) + "]"
+        encoder = "" if policy.encoder in ("mlp", "grid") or not space.is_image else " --set policy.encoder=mlp"
+        divided = ", and the encoder divides bytes by 255" if _divides_bytes(spec, space) else ""
+        return (
+            f"{name!r} has no value above {largest}{divided}: if its values are codes, such as kinds of things, and "
+            f"not quantities, use --set policy.codes.{name}={codes}{encoder}, with as many codes as there can be"
+        )
     return ""
+
+
+def _divides_bytes(spec: RunSpec, space: ArraySpace) -> bool:
+    policy = spec.policy
+    if space.is_image:
+        return policy.encoder != "grid" and not (policy.encoder == "mlp" and policy.normalize_observations)
+    return policy.encoder != "grid" and not policy.normalize_observations
 
 
 def uninformative_bounds(report: EnvironmentReport) -> str:

@@ -1,6 +1,7 @@
-"""Gymnasium's own environment checker."""
+"""What observations are besides their spaces: texts, codes. And gymnasium's own environment checker."""
 
 import functools
+import importlib
 import re
 import time
 import warnings
@@ -8,6 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from daedalus.actor.environments.bots import RandomActions
@@ -18,6 +20,7 @@ from daedalus.actor.environments.info import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import unfit_code
 from daedalus.protocol.spec import EnvironmentSpec
 
 _RESETS, _SECONDS = 20, 2.0  # the most resets, and the time for those after the second
@@ -70,6 +73,36 @@ class Texts:
             text, seen = str(leaf.of(observation)), self._seen[leaf.name]
             if text not in seen and len(seen) < 2:
                 seen.append(text)
+
+
+_MINIGRID = "minigrid.minigrid_env"  # module of the class of all its environments
+_CODE_CHANNELS = ("OBJECT_TO_IDX", "COLOR_TO_IDX", "STATE_TO_IDX")  # tables of the kinds, colours and states
+_DIRECTIONS = 4  # which are the states of an agent
+
+
+def minigrid_codes(environment: gymnasium.Env, space: gymnasium.Space, seed: int) -> dict[str, tuple[int, ...]]:
+    """Return the components of MiniGrid's observations that are codes, with the number of codes of each channel.
+
+    They are declared as bytes from 0 to 255, as its pictures and any picture are. So the class of the environment
+    tells, and its first observation: a picture of a maze has no values as low as codes. The numbers are those of the
+    installed release, with kinds of things that the user has added.
+    """
+    if not any(each.__module__ == _MINIGRID for each in type(environment.unwrapped).__mro__):
+        return {}
+    constants = importlib.import_module("minigrid.core.constants")
+    kinds, colours, states = (max(getattr(constants, table).values()) + 1 for table in _CODE_CHANNELS)
+    codes = (kinds, colours, max(states, _DIRECTIONS))
+    with suppress(Exception, SystemExit):  # of the user's code; playing reports it
+        observation = environment.reset(seed=seed)[0]
+        return {
+            leaf.name: codes
+            for leaf in leaves(space, "observation")
+            if leaf.space.dtype == np.uint8
+            and len(shape := leaf.space.shape or ()) == 3
+            and shape[2] == len(codes)
+            and not unfit_code(leaf.of(observation), codes)
+        }
+    return {}
 
 
 def _shown(text: str) -> str:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import Texts
+from daedalus.actor.checking.checker import Texts, minigrid_codes
 from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
@@ -254,10 +254,12 @@ def _check_one(
         rest = rest.model_copy(update={"leave_out": (*rest.leave_out, *texts.names)})
         space = without(environment.observation_space, rest.leave_out)
         transforms = Transforms(rest, environment.observation_space, environment.action_space, mask)
+        altered = rest.grey or rest.resize is not None  # as pixels are
+        codes = {} if altered else minigrid_codes(environment, space, seed)
         play = _Play(spec, environment, space, transforms, RandomActions(transforms.spaces.actions, seed), texts)
         if seconds > 0.0:
             play.run(seconds, env_steps, seed)
-        return play.report()
+        return play.report().model_copy(update={"codes": codes})
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     finally:
@@ -271,6 +273,14 @@ def _first_mask(environment: gymnasium.Env, seed: int) -> Any:
         mask = environment.reset(seed=seed)[1].get(MASK_KEY)
         return None if mask is None else mask_of_one(mask)
     return None
+
+
+_MOST_PLACES = 16  # of the last axis, which is else not one of channels
+
+
+def _places(space: ArraySpace) -> int:
+    """Return in how many places of the last axis the largest values are counted; 1: in all together."""
+    return space.shape[-1] if len(space.shape) == 3 and space.shape[-1] <= _MOST_PLACES else 1
 
 
 class _Play:
@@ -292,10 +302,10 @@ class _Play:
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
         self._warnings = {text: text for text in unsaved_statistics(environment)}  # the first of each kind
-        self._pixel_maxima = {  # the largest value seen in each image
-            name: 0
+        self._byte_maxima = {  # the largest values seen in each place of the last axis, or in all
+            name: np.zeros(_places(each), np.uint8)
             for name, each in transforms.spaces.observations.items()
-            if isinstance(each, ArraySpace) and each.is_image
+            if isinstance(each, ArraySpace) and each.dtype == "uint8" and len(each.shape) in (2, 3)
         }
         self._env_steps, self._resets = 0, 0
         self._step_seconds, self._busy_seconds, self._reset_seconds = 0.0, 0.0, 0.0
@@ -333,7 +343,7 @@ class _Play:
             busy_share=min(self._busy_seconds / max(self._step_seconds, 1e-9), 1.0),
             reset_seconds=self._reset_seconds / max(self._resets, 1),
             time_limit=getattr(self._environment.spec, "max_episode_steps", None),
-            pixel_maxima=self._pixel_maxima if self._env_steps else {},
+            byte_maxima={name: tuple(map(int, each)) for name, each in self._byte_maxima.items() if self._env_steps},
             lengths=tuple(self._lengths),
             returns=tuple(self._returns),
         )
@@ -389,8 +399,8 @@ class _Play:
             raise _ProblemError(str(error)) from None
         self._precision.add(observation, starts=starts)
         self._masks = observed.masks
-        for name, largest in self._pixel_maxima.items():
-            self._pixel_maxima[name] = max(largest, int(observed.frames[name].max()))
+        for name, largest in self._byte_maxima.items():
+            np.maximum(largest, observed.frames[name].reshape(-1, len(largest)).max(0), out=largest)
 
     def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
         try:

@@ -1,6 +1,7 @@
 """Backend `gymnasium`: its environments and those that users register with it. Also backend `fast`, for CarRacing."""
 
 import importlib
+import sys
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -77,6 +78,10 @@ class EnvironmentFactory:
             raise EnvironmentSetupError(
                 f"environment {spec.id} cannot render {self.render_mode} images: {reason}"
             ) from None
+        if "minigrid.minigrid_env" in sys.modules:
+            from daedalus.actor.environments import minigrid_views  # needs an optional package
+
+            minigrid_views.speed_up(environment)
         environment = atari.wrapped(environment, of_atari)
         below = None
         if spec.wrap is not None:

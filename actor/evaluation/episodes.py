@@ -78,6 +78,13 @@ class RunningEpisodes:
         for name, values in choice.actions.items():
             if not np.isfinite(values[:count][playing]).all():
                 raise PolicyError(f"the policy chose an action whose component {name!r} is not finite: do not use it")
+        unknown = np.flatnonzero(np.isnan(choice.log_probs[:count]) & playing)
+        if len(unknown):
+            raise PolicyError(
+                f"the policy has no probability for its action in environment {unknown[0]}: its observation has a "
+                "value that is not among policy.codes, or the weights are not finite; correct the environment, or do "
+                "not use this policy"
+            )
         if self._acting is None:
             self._state = choice.state[:count]
         else:

@@ -17,11 +17,12 @@ from daedalus.actor.environments.vector_environments import Observed
 from daedalus.actor.evaluation.episodes import RunningEpisodes
 from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
+from daedalus.policy.component_inputs import coded_components
 from daedalus.policy.saving.hub import pull
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.policy.saving.saved_policy import pretrained as pretrained_directory
 from daedalus.policy.user_modules import NO_MODULES, ModuleNotAllowedError, UserModules
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, unfit_code
 from daedalus.protocol.spec import RunSpec
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ class Policy:
         if self._pools_frames:
             observation = self._pooled(observation)
         if self._repeats_left == 0:
-            self._action = self._choose(self._transforms.observe_one(observation, action_mask), sampled)
+            self._action = self._choose(self._observed(observation, action_mask), sampled)
             self._repeats_left = self._repeat
         self._repeats_left -= 1
         return copy.deepcopy(self._action)
@@ -132,7 +133,7 @@ class Policy:
         masks = [None] * count if action_masks is None else action_masks
         for mask in masks:
             self._check_mask(mask)
-        rows = [self._transforms.observe_one(*row) for row in zip(observations, masks, strict=True)]
+        rows = [self._observed(*row) for row in zip(observations, masks, strict=True)]
         frames = {name: np.concatenate([row.frames[name] for row in rows]) for name in rows[0].frames}
         legal = {name: np.concatenate([row.masks[name] for row in rows]) for name in rows[0].masks}
         running = RunningEpisodes(spaces, self._runtime, count)
@@ -157,6 +158,14 @@ class Policy:
             except PolicyError as error:
                 raise ValueError(str(error)) from None
         return self._network
+
+    def _observed(self, observation: Any, action_mask: Any) -> Observed:
+        """Return an observation as the policy reads it. Raises ValueError if it is none of the space, or no code."""
+        observed = self._transforms.observe_one(observation, action_mask)
+        for name, codes in coded_components(self.spec.policy, self._transforms.spaces.observations).items():
+            if unfit := unfit_code(observed.frames[name], codes):
+                raise ValueError(f"component {name!r} of the observation {unfit}")
+        return observed
 
     def _pooled(self, frame: Any) -> Any:
         """Return the maximum of the newest two observations, as Atari games were observed in training."""

@@ -7,10 +7,10 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
-from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.collecting.lineup import Lineup
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.actor.session.conversation import RunOverError
@@ -21,9 +21,55 @@ from daedalus.actor.session.uploading import RolloutUploadMaker, UploadMaker, ma
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError, PolicyRuntime
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Snapshot, Welcome
-from daedalus.protocol.spec import UnsupportedRunError
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import ActorSpec, UnsupportedRunError
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import Transport
 from daedalus.transport.process_usage import UsageMeter
+
+
+class Collector(Protocol):
+    """A source of rollouts for one learner after the other. Its methods are for the service's thread."""
+
+    @property
+    def lineup(self) -> Lineup | None:
+        """Who plays the seats of the games that it steps; None if it steps none, and before `prepare`."""
+        ...
+
+    def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
+        """Prepare for a run, and return its spaces and E, the number of environments.
+
+        Raises EnvironmentSetupError or ActorError if this actor cannot take part in the run.
+        """
+        ...
+
+    def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
+        """Collect with a policy from now on; `load` provides its weights before the first rollout.
+
+        `seed` is the `entropy` of the learner's Welcome, and `epsilon` is its own.
+        """
+        ...
+
+    def load(self, snapshot: Snapshot) -> None:
+        """Use these weights from the next rollout on."""
+        ...
+
+    def confirm(self, at: float) -> None:
+        """Note that the loaded snapshot was the learner's newest at a monotonic time, in seconds."""
+        ...
+
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None]) -> Rollout | None:
+        """Return the next rollout, or None if it depends on somebody else and is not complete yet.
+
+        The rollout's arrays are valid until the next call. While this method makes the rollout, it calls `on_row`
+        before each row; what `on_row` raises ends the rollout.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release everything that `prepare` created. Idempotent."""
+        ...
+
 
 _logger = logging.getLogger(__name__)
 

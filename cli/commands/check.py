@@ -96,7 +96,8 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
     chosen = report = _report(check)
     processes = ""
     if choice.env is not None:
-        defaults = default_settings(report.spaces, [*environment.leave_out, *report.constant_texts], report.seats)
+        leave_out = [*environment.leave_out, *report.constant_texts]
+        defaults = default_settings(report.spaces, leave_out, report.seats, report.codes)
         defaults, processes = with_measured_processes(choice.spec, defaults, report)
         spec = choice.spec(defaults)
         if spec.environment != environment and report.spaces is not None:
@@ -176,6 +177,7 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
         return "", ""
     from daedalus.algorithms.gradients import GradientComputer
     from daedalus.policy.acting.program import export_program
+    from daedalus.policy.component_inputs import coded_components
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
     from daedalus.policy.user_modules import NetworkError
@@ -190,4 +192,6 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     memory = "" if spec.policy.memory == "none" else f", memory {spec.policy.memory}"
     parameters = sum(parameter.numel() for parameter in network.parameters())
     encoder = encoder_names(spec.policy, spaces.observations)
-    return f"encoder {encoder}{memory}, {parameters:,} parameters", ""
+    coded = coded_components(spec.policy, spaces.observations)
+    codes = "".join(f", {name} as one-hot codes ({' + '.join(map(str, each))})" for name, each in coded.items())
+    return f"encoder {encoder}{codes}{memory}, {parameters:,} parameters", ""

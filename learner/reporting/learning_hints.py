@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol.spec import TrainingSpec
 from daedalus.protocol.texts import exact_number, short_number
 
 _BASELINE_EPISODES = 20  # after so many, the policy is still about as random as at the start,
@@ -24,9 +25,10 @@ class LearningHint:
     with opponents, whose returns say nothing about the strength of play.
     """
 
-    def __init__(self, budget: int, *, normalizes_rewards: bool) -> None:
-        """`budget` is in env_steps; `normalizes_rewards` is the setting `training.normalize_rewards`."""
-        self._budget, self._normalizes_rewards = budget, normalizes_rewards
+    def __init__(self, training: TrainingSpec) -> None:
+        """Construct the judge of a run with these settings."""
+        self._budget, self._normalizes_rewards = training.env_steps, training.normalize_rewards
+        self._is_curious = training.curiosity > 0.0
         self._first_return: tuple[float, float] | None = None  # mean and standard deviation
         self._first_entropy: float | None = None
         self._explained: list[float] = []
@@ -74,10 +76,11 @@ class LearningHint:
             if now > before + _BETTER * deviation:
                 return ""
         if self._lowest == self._highest:
+            explore = "" if self._is_curious else "; training.curiosity=1 explores more, where observations come back"
             return (
                 "this run has nothing to learn from: every episode so far has the return "
-                f"{exact_number(self._lowest)}, so that "
-                "no action was better than another; check the reward, and whether random actions can reach the goal"
+                f"{exact_number(self._lowest)}, so that no action was better than another; check the reward, and "
+                f"whether random actions can reach the goal{explore}"
             )
         first, entropy = self._first_entropy or 0.0, row.get("entropy", 0.0)
         returns = f"after a fifth of the budget the mean return is {short_number(row['episode_return_mean'])}"

@@ -49,6 +49,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "value_error_p95",
         "learning_rate",
         "entropy_bonus",
+        "first_visit_fraction",
+        "curiosity_reward_mean",
     ),
     "evaluation": (
         "evaluation_return_mean",

@@ -66,7 +66,7 @@ class RunReporter:
         self._bottleneck = ""  # at the newest row
         self._usage = UsageMeter()
         self._episode_hint = EpisodeHint(training.env_steps)
-        self._learning_hint = LearningHint(training.env_steps, normalizes_rewards=training.normalize_rewards)
+        self._learning_hint = LearningHint(training)
 
     def begin(self, recorder: Recorder, now: float) -> None:
         """Start to measure rates, at the start of training. The recorder is closed with the reporter."""

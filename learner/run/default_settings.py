@@ -1,9 +1,10 @@
-"""Default settings of an environment without a preset, chosen by its spaces and seats and by nothing else about it."""
+"""Default settings of an environment without a preset, chosen by its observations, actions and seats."""
 
 import importlib.resources
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal
 
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
@@ -18,15 +19,21 @@ _FULL_SEATS = 2  # of a game: if there are more, an actor plays fewer copies, fo
 _FULL_NOISE = 2  # numbers of an action: if there are more, each is explored less
 
 
-def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = (), seats: int = 1) -> dict[str, Any]:
+def default_settings(
+    spaces: Spaces | None,
+    leave_out: Sequence[str] = (),
+    seats: int = 1,
+    codes: Mapping[str, tuple[int, ...]] = MappingProxyType({}),
+) -> dict[str, Any]:
     """Return the default settings for the spaces of an environment, as a preset has them.
 
     Args:
       spaces: of the environment without transforms; None if they are not known.
       leave_out: components of the observation that are not in `spaces`.
       seats: agents of a game that the policy plays: each has rows of its own.
+      codes: components of the observation that are codes, as `policy.codes` has them.
     """
-    kind = _UNKNOWN if spaces is None else kind_of(spaces)
+    kind = _UNKNOWN if spaces is None else kind_of(spaces, codes)
     file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
     settings = tomllib.loads(file.read_text("utf-8"))
     if kind == "large_images" and spaces is not None and any(space.image_shape[0] != _RGB for space in _images(spaces)):
@@ -45,6 +52,8 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = (), seats
             collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)
     if spaces is not None:
         _fit_rollouts(settings, spaces, seats)
+    if codes:
+        settings["policy"]["codes"] = {name: list(numbers) for name, numbers in codes.items()}
     if leave_out:
         settings.setdefault("environment", {})["leave_out"] = list(leave_out)
     return settings
@@ -76,9 +85,12 @@ def _fit_rollouts(settings: dict[str, Any], spaces: Spaces, seats: int) -> None:
         each["collection"]["rollout_length"] = min(each["collection"]["rollout_length"], shortest)
 
 
-def kind_of(spaces: Spaces) -> Kind:
-    """Return the kind of spaces: with an image, else with continuous actions, else with discrete ones only."""
-    images = _images(spaces)
+def kind_of(spaces: Spaces, coded: Collection[str] = ()) -> Kind:
+    """Return the kind of spaces: with an image, else with continuous actions, else with discrete ones only.
+
+    A component in `coded` is no image.
+    """
+    images = _images(spaces, coded)
     if images:
         return "large_images" if any(max(space.image_shape[1:]) > _LARGE for space in images) else "images"
     return "vectors_continuous" if _has_continuous(spaces) else "vectors_discrete"
@@ -97,5 +109,6 @@ def _noise_scale(spaces: Spaces) -> float:
     return min(1.0, math.sqrt(_FULL_NOISE / numbers))
 
 
-def _images(spaces: Spaces) -> list[ArraySpace]:
-    return [space for space in spaces.observations.values() if isinstance(space, ArraySpace) and space.is_image]
+def _images(spaces: Spaces, coded: Collection[str] = ()) -> list[ArraySpace]:
+    observed = [space for name, space in spaces.observations.items() if name not in coded]
+    return [space for space in observed if isinstance(space, ArraySpace) and space.is_image]

@@ -178,8 +178,8 @@ def other_network(policy: SavedPolicy, spec: PolicySpec, spaces: Spaces) -> str:
 
     before = policy.spec.policy
     names = encoder_names(before, policy.spaces.observations), encoder_names(spec, spaces.observations)
-    different = {"encoder": names}
-    if "mlp" in names[1] or ":" in names[1]:
+    different: dict[str, tuple[Any, Any]] = {"encoder": names, "codes": (before.codes, spec.codes)}
+    if "mlp" in names[1] or "grid" in names[1] or ":" in names[1]:
         different["activation"] = before.activation, spec.activation
     if any(isinstance(space, ContinuousSpace) for space in spaces.actions.values()):
         different["distribution"] = before.distribution, spec.distribution

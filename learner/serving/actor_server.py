@@ -16,8 +16,8 @@ from collections.abc import Callable
 from functools import partial
 from types import MappingProxyType
 
-from daedalus.learner.serving.orders import Orders
 from daedalus.learner.serving.query_responses import JoinResponses, StatusResponses
+from daedalus.learner.serving.received_orders import Orders
 from daedalus.learner.serving.rollout_intake import POLL_SECONDS, RolloutIntake
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher

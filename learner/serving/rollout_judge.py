@@ -263,7 +263,7 @@ class RolloutJudge:
             return gradient_violation(rollout, self._spec, self.gradient_shapes, spaces, actor.environments)
         return (
             self._shape_violation(rollout, actor)
-            or first_component_violation(rollout, spaces)
+            or first_component_violation(rollout, spaces, self._spec.policy)
             or _number_violation(rollout)
             or self._value_violation(rollout)
             or _episode_violation(rollout)

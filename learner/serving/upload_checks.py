@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from daedalus.policy.normalized import normalized_components
+from daedalus.policy.component_inputs import coded_components, normalized_components
 from daedalus.protocol.compact import bits_of, float32
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.spaces import (
@@ -15,9 +15,10 @@ from daedalus.protocol.spaces import (
     ContinuousSpace,
     DiscreteSpace,
     Spaces,
+    unfit_code,
     unfit_number,
 )
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import (
     DIAGNOSTICS,
@@ -34,8 +35,11 @@ _MAX_LOG_DENSITY = 20.0  # of one continuous action: its density cannot be highe
 _MAX_ACTION = 1e6  # of a continuous action: beyond it squares lose all precision
 
 
-def first_component_violation(rollout: Rollout, spaces: Spaces) -> str:
-    """Return where observations, actions, masks or log-probabilities break the spaces, or an empty string."""
+def first_component_violation(rollout: Rollout, spaces: Spaces, policy: PolicySpec) -> str:
+    """Return where observations, actions, masks or log-probabilities break the spaces, or an empty string.
+
+    So do observations that are no codes of the `policy`.
+    """
     for kind, given, expected in (
         ("frames", rollout.frames, spaces.observations),
         ("actions", rollout.actions, spaces.actions),
@@ -43,8 +47,11 @@ def first_component_violation(rollout: Rollout, spaces: Spaces) -> str:
     ):
         if given.keys() != expected.keys():
             return f"{kind} has the components {listed_names(given)}, expected {listed_names(expected)}"
+    coded = coded_components(policy, spaces.observations)
     for name, space in spaces.observations.items():
         violation = _observation_violation(rollout, rollout.frames[name], space)
+        if not violation and name in coded:
+            violation = unfit_code(rollout.frames[name], coded[name])
         if violation:
             return f"frames/{name} {violation}"
     for name, space in spaces.actions.items():
@@ -180,7 +187,10 @@ def _gradient_violation(gradient: Gradient, shapes: Shapes) -> str:
         )
     norm = gradient.norm
     if not math.isfinite(norm) and not all(np.isfinite(values).all() for values in gradient.gradient.values()):
-        return "the gradient has a value that is not finite: its observations or rewards are not finite, or too large"
+        return (
+            "the gradient has a value that is not finite: its observations or rewards are not finite, or too large, or "
+            "an observation has a value that is not among policy.codes"
+        )
     if not norm <= LARGEST_GRADIENT_NORM:  # nor nan
         return (
             f"the norm of the gradient is {norm:.3g}, at most {LARGEST_GRADIENT_NORM:g} is allowed: "

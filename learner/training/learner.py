@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
+from daedalus.algorithms.curiosity import Curiosity
 from daedalus.algorithms.diagnostics import BATCH_METRICS, FirstPass, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, exact, packed
@@ -124,6 +125,7 @@ def moments_in(gradient: Gradient) -> dict[str, Moments]:
 
 # Names of what actors vote on besides components of observations (algorithms/normalization.py).
 _RETURNS, _REWARDS, _NORM, _METRICS = "returns", "rewards", "gradient norm", "metrics/"
+_CURIOSITY = "curiosity/"  # beginning of the names of its statistics in checkpoints
 
 _Seen = dict[str, Moments]
 _Upload = TypeVar("_Upload", Rollout, Gradient)
@@ -170,6 +172,9 @@ class Learner:
         self._rewards: RewardNormalizer | None = None
         if spec.normalize_rewards:
             self._rewards = RewardNormalizer(spec.discount_factor, synchronous=spec.record.synchronous)
+        self._curiosity: Curiosity | None = None
+        if spec.curiosity:
+            self._curiosity = Curiosity(spec.discount_factor, synchronous=spec.record.synchronous)
         self._ranges, self._reward_name = ConfirmedRanges(), _REWARDS if self._rewards is None else _RETURNS
         self._reward_shares: dict[Rollout, float] = {}  # of the newest batch: with how much of their size they count
         self.far_outside: dict[Upload, str] = {}  # of the newest batch: what was left out, and its component
@@ -206,6 +211,8 @@ class Learner:
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
         end = self.policy_version + self.updates_of(rollouts)
+        if self._curiosity is not None:
+            self._curiosity.look(rollouts, _annealed(self._spec.curiosity, 0.0, progress))
         batch, kept, seen = self._sorted_out(rollouts)
         left_out: list[Rollout] = []
         while kept and not self._make_updates(batch, progress, end):
@@ -342,7 +349,10 @@ class Learner:
         return self._scaled(self._assembler.join(rollouts), rollouts)
 
     def _scaled(self, batch: Batch, rollouts: Sequence[Rollout]) -> Batch:
-        """Scale the rewards of a batch in place: normalised ones, and those that are not confirmed to what counts."""
+        """Scale the rewards of a batch in place: normalised ones, and those that are not confirmed to what counts.
+
+        Add the rewards of curiosity, which have a scale of their own.
+        """
         first = 0
         for rollout in rollouts:
             if (share := self._reward_shares.get(rollout, 1.0)) < 1.0:
@@ -350,6 +360,8 @@ class Learner:
             first += rollout.environments
         if self._rewards is not None:
             self._rewards.scale(batch)
+        if self._curiosity is not None:
+            self._curiosity.add_to(batch, rollouts)
         return batch
 
     def learning_rate(self, progress: float) -> float:
@@ -367,7 +379,9 @@ class Learner:
             return received
         first_pass, self.first_pass = self.first_pass, None
         rho_clip = self._spec.rho_clip if self._spec.record.corrected else None
-        return {} if first_pass is None else diagnostics(first_pass, rho_clip)
+        if first_pass is None:
+            return {}
+        return diagnostics(first_pass, rho_clip) | ({} if self._curiosity is None else self._curiosity.metrics())
 
     def anneal_exploration(self, annealing: float) -> None:
         """Set how much actors with the next snapshot explore: a result of `TrainingSpec.exploration_annealing`."""
@@ -415,6 +429,8 @@ class Learner:
         statistics |= self._gradients.statistics
         if self._rewards is not None:
             statistics |= {f"returns/{name}": value for name, value in self._rewards.moments.state().items()}
+        if self._curiosity is not None:
+            statistics |= {_CURIOSITY + name: value for name, value in self._curiosity.statistics.items()}
         return statistics
 
     def load(self, parameters: dict[str, np.ndarray]) -> None:
@@ -459,6 +475,8 @@ class Learner:
             self._network.exploration.set_annealing(float(parameters[ANNEALING].item()))
         for name, statistic in self._statistics().items():
             saved = state.get(name)
+            if saved is None and name.startswith(_CURIOSITY):
+                continue  # the run was not curious before
             if saved is not None and name.endswith("/count") and not saved.shape:
                 saved = saved.expand(statistic.shape)  # in checkpoints of earlier releases: one count for all numbers
             if saved is None or saved.shape != statistic.shape:

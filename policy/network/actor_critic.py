@@ -5,13 +5,13 @@ from contextlib import nullcontext
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.action_distribution import ActionDistribution
-from daedalus.policy.network.encoders import build_encoder
+from daedalus.policy.network.encoders import build_codes, build_encoder
 from daedalus.policy.network.exploration import Exploration
 from daedalus.policy.network.layers import Components, orthogonal
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.policy.network.recurrent_memory import Gru, NoMemory
-from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec, PolicySpec
@@ -20,7 +20,7 @@ _POLICY_GAIN = 0.01  # the initial policy is nearly uniform for every observatio
 
 
 class ActorCritic(nn.Module):
-    """Normaliser, encoder, memory, policy head with the distribution of actions, value head.
+    """Normaliser and codes, encoder, memory, policy head with the distribution of actions, value head.
 
     Learning calls `forward`; acting needs only `act`, which is what the exported program computes. For an algorithm of
     action values, the outputs of the policy head are Q(s, a), and there is no value head.
@@ -44,6 +44,7 @@ class ActorCritic(nn.Module):
         self.distribution = ActionDistribution(spec, spaces, modules, training)
         self.exploration = Exploration(spaces) if training is not None and training.explores else None
         self.normalizer = ObservationNormalizer(normalized_components(spec, spaces.observations))
+        self.codes = build_codes(spec, spaces.observations)
         self.encoder = build_encoder(spec, spaces.observations, modules)
         features = self.encoder.features
         self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)
@@ -79,20 +80,24 @@ class ActorCritic(nn.Module):
 
         Returns: as `unroll`.
         """
-        return self.unroll(self.normalizer(observations), state, starts)
+        return self.unroll(self.prepare(observations), state, starts)
 
-    def unroll(self, normalized: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute policies and values for R consecutive rows of B environments from normalised observations.
+    def prepare(self, observations: Components) -> Components:
+        """Normalise numbers and make codes one-hot: {name: [..., *stacked_shape]}, for any leading axes."""
+        return self.codes(self.normalizer(observations))
+
+    def unroll(self, prepared: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute policies and values for R consecutive rows of B environments from prepared observations.
 
         Args:
-          normalized: what `normalizer` returns, of each component [R, B, *stacked_shape].
+          prepared: what `prepare` returns, of each component [R, B, ...].
           state: [B, S] float32, the memory before row 0.
           starts: [R, B] bool, whether an episode starts with the row, which clears the memory.
 
         Returns: parameters of the action distributions [R, B, P] and values [R, B], float32 also under autocast. The
         values are 0 without a value head.
         """
-        flat = {name: values.flatten(0, 1) for name, values in normalized.items()}
+        flat = {name: values.flatten(0, 1) for name, values in prepared.items()}
         features = self.encoder(flat).unflatten(0, starts.shape)  # [R, B, F]
         remembered = critic = self.memory.unroll(features, state, starts)
         if self.value_encoder is not None:
@@ -107,7 +112,7 @@ class ActorCritic(nn.Module):
 
     def step(self, observations: Components, state: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the policies of one row: state [N, S] -> distribution parameters [N, P], next state [N, S]."""
-        remembered, state = self.memory.step(self.encoder(self.normalizer(observations)), state)
+        remembered, state = self.memory.step(self.encoder(self.prepare(observations)), state)
         return self.policy_head(remembered), state
 
     def act(

@@ -47,6 +47,7 @@ def as_floats(observations: Tensor) -> Tensor:
 
 
 _GAIN = math.sqrt(2.0)  # of a layer followed by a ReLU
+_FILTERS, _SMALLEST_UNPADDED = 16, 5  # of the convolution of maps; cells of a side
 
 
 class ImageEncoder(nn.Module):
@@ -103,6 +104,26 @@ def impala(space: ArraySpace) -> ImageEncoder:
     stages = [_stage(first(layout.shape[0], 16, 3, padding=1))]
     stages += [_stage(nn.Conv2d(inputs, outputs, 3, padding=1)) for inputs, outputs in ((16, 32), (32, 32))]
     return ImageEncoder(layout, nn.Sequential(*stages, nn.ReLU()), lambda inputs: _rectified(inputs, 256))
+
+
+class GridConvolution(nn.Module):
+    """The convolution of Young and Tian (2019), "MinAtar": 16 filters of 3 x 3, with a ReLU.
+
+    For maps (height, width, planes) of a few cells, read as the numbers they are. A map with a side below 5 is padded.
+    """
+
+    def __init__(self, space: ArraySpace) -> None:
+        super().__init__()
+        height, width, planes = space.shape
+        padding = 0 if min(height, width) >= _SMALLEST_UNPADDED else 1
+        self._split = (space.frames, height, width, planes)
+        self.convolution = orthogonal(nn.Conv2d(space.frames * planes, _FILTERS, 3, padding=padding), _GAIN)
+        self.width = _FILTERS * (height - 2 + 2 * padding) * (width - 2 + 2 * padding)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return the outputs of all filters: maps [N, *stacked_shape] -> [N, width]."""
+        planes = maps.reshape(-1, *self._split).permute(0, 1, 4, 2, 3).flatten(1, 2)  # [N, k * C, H, W]
+        return self.convolution(as_floats(planes)).relu().flatten(1)
 
 
 class ArticleEncoder(ImageEncoder):

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.layers import find_class
-from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import NetworkError, UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces

@@ -10,9 +10,10 @@ from itertools import chain
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
+from daedalus.policy.component_inputs import coded_components, codes_problem, encoded_spaces, grid_components
+from daedalus.policy.network.convolutional import ArticleEncoder, GridConvolution, ImageEncoder, impala, nature, small
 from daedalus.policy.network.custom_encoder import CustomEncoder
-from daedalus.policy.network.layers import Components, variables_and_values
+from daedalus.policy.network.layers import Components, OneHotCodes, variables_and_values
 from daedalus.policy.network.perceptron import Perceptron
 from daedalus.policy.user_modules import NO_MODULES, NetworkError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces
@@ -24,13 +25,18 @@ _SMALLEST_FOR_NATURE = 36  # pixels of the shorter side
 class FlatEncoder(nn.Module):
     """Fully connected layers (possibly none) on all components side by side: {name: [N, ...]} -> [N, features].
 
-    Arrays are flattened, `uint8` ones that are not normalised scaled to [0, 1]; discrete components are one-hot.
+    Arrays are flattened, `uint8` ones that are not normalised scaled to [0, 1]; discrete components are one-hot. With
+    the encoder `grid`, maps go through a convolution before.
     """
 
     def __init__(self, spaces: ObservationSpaces, spec: PolicySpec) -> None:
         super().__init__()
         self._spaces = spaces
-        self.layers = Perceptron(sum(_width(space) for space in spaces.values()), spec.hidden, spec.activation)
+        grids = {name: GridConvolution(space) for name, space in grid_components(spec, spaces).items()}
+        widths = [grids[name].width if name in grids else _width(space) for name, space in spaces.items()]
+        self.layers = Perceptron(sum(widths), spec.hidden, spec.activation)
+        self.grids = nn.ModuleList(grids.values())
+        self._grids = dict(zip(grids, self.grids, strict=True))
         self.features = self.layers.features
         self._first_columns = _first_columns(spaces)
         # No buffers: they would become inputs of the exported program.
@@ -51,6 +57,8 @@ class FlatEncoder(nn.Module):
 
     def _inputs(self, name: str, observations: Tensor) -> Tensor:
         """Return the inputs of the layers [N, width] float32 for one component."""
+        if name in self._grids:
+            return self._grids[name](observations)
         space = self._spaces[name]
         if isinstance(space, ArraySpace):
             return _numbers(observations)
@@ -101,6 +109,13 @@ class CompositeEncoder(nn.Module):
 Encoder = FlatEncoder | ArrayEncoder | CompositeEncoder | CustomEncoder
 
 
+def build_codes(spec: PolicySpec, spaces: ObservationSpaces) -> OneHotCodes:
+    """Return what makes one-hot numbers of codes. Raises NetworkError if `policy.codes` do not fit the spaces."""
+    if problem := codes_problem(spec, spaces):
+        raise NetworkError(problem)
+    return OneHotCodes(coded_components(spec, spaces))
+
+
 def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModules = NO_MODULES) -> Encoder:
     """Return the encoder that the specification names, for observations of the spaces.
 
@@ -111,10 +126,19 @@ def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModu
     """
     if ":" in spec.encoder:
         return CustomEncoder(spec, spaces, modules)
+    coded = coded_components(spec, spaces)
+    spaces = encoded_spaces(spec, spaces)
     images = {name: space for name, space in spaces.items() if isinstance(space, ArraySpace) and space.is_image}
-    if spec.encoder == "mlp" or (spec.encoder == "auto" and not images):
+    if spec.encoder == "grid" and not grid_components(spec, spaces):
+        raise NetworkError(
+            "the encoder 'grid' takes maps (height, width, planes), but the observations have no array of three axes: "
+            "set policy.encoder to mlp, or add an axis in a wrapper"
+        )
+    if spec.encoder in ("mlp", "grid") or (spec.encoder == "auto" and not images):
         return FlatEncoder(spaces, spec)
     if len(spaces) == 1:
+        if coded:
+            raise NetworkError(f"the encoder {spec.encoder!r} takes no codes: set policy.encoder to mlp or grid")
         name, space = next(iter(spaces.items()))
         if isinstance(space, DiscreteSpace):
             raise NetworkError(f"the encoder {spec.encoder!r} takes arrays, not {space}: set policy.encoder to mlp")
@@ -128,7 +152,7 @@ def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModu
 
 def encoder_names(spec: PolicySpec, spaces: ObservationSpaces) -> str:
     """Return the names of the encoders that `build_encoder` makes, such as `nature and mlp`."""
-    if ":" in spec.encoder or spec.encoder == "mlp":
+    if ":" in spec.encoder or spec.encoder in ("mlp", "grid"):
         return spec.encoder
     images = [space for space in spaces.values() if isinstance(space, ArraySpace) and space.is_image]
     names = [_image_encoder_name(spec.encoder, space) for space in images]

@@ -1,6 +1,6 @@
 """Layers that torch does not have, or that are slower in torch."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -25,6 +25,36 @@ def variables_and_values(counts: Sequence[int]) -> tuple[Tensor, Tensor]:
     sizes = torch.tensor(counts)
     variables = torch.arange(len(counts)).repeat_interleave(sizes)
     return variables, torch.arange(len(variables)) - (sizes.cumsum(0) - sizes)[variables]
+
+
+class OneHotCodes(nn.Module):
+    """Codes as one-hot numbers: {name: [..., C] uint8} -> [..., codes of all C places] float32.
+
+    Where a value is no code the numbers are NaN, and so are the log-probabilities of actions: the policy does not act
+    on it unnoticed. The learner refuses such observations (protocol/spaces.py).
+    """
+
+    def __init__(self, codes: Mapping[str, tuple[int, ...]]) -> None:
+        """Construct from the number of codes in each place of the last axis, by component."""
+        super().__init__()
+        # No buffers: they would become inputs of the exported program.
+        self._tables: dict[str, tuple[Tensor, Tensor, Tensor]] = {}  # place and code of each number; codes of the place
+        for name, counts in codes.items():
+            places, values = variables_and_values(counts)
+            self._tables[name] = places, values.float(), torch.tensor(counts)[places].float()
+
+    def forward(self, observations: Components) -> Components:
+        """Encode the components that are codes; others are left as they are."""
+        encoded = dict(observations)
+        for name, tables in self._tables.items():
+            if tables[0].device != observations[name].device:  # once
+                places, values, counts = (table.to(observations[name].device) for table in tables)
+                self._tables[name] = tables = places, values, counts
+            places, values, counts = tables
+            # As floats, which every release of onnxruntime compares.
+            given = observations[name].to(torch.float32).index_select(-1, places)
+            encoded[name] = torch.where(given < counts, (given == values).to(torch.float32), torch.nan)
+        return encoded
 
 
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)

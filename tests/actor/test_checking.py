@@ -379,27 +379,40 @@ def test_several_images_in_one_array_are_noted(
 @pytest.mark.parametrize(
     ("value", "policy", "remedy"),
     [
-        (3, {"normalize_observations": True}, "--set policy.encoder=mlp"),
-        (3, {}, "--set policy.encoder=mlp --set policy.normalize_observations=true"),
-        (3, {"encoder": "mlp"}, "--set policy.normalize_observations=true"),
-        (3, {"encoder": "mlp", "normalize_observations": True}, ""),
+        (3, {}, ", and the encoder divides bytes by 255: if its values are codes, such as kinds of things, and not"),
+        (3, {}, "use --set policy.codes.observation=[4] --set policy.encoder=mlp, with as many codes as there can be"),
+        (3, {"encoder": "mlp"}, "use --set policy.codes.observation=[4], with as many codes as there can be"),
+        (3, {"encoder": "mlp", "normalize_observations": True}, "'observation' has no value above 3: if its values"),
+        (3, {"encoder": "mlp", "codes": {"observation": (9,)}}, ""),
         (3, {"encoder": "module:Own"}, ""),
         (0, {}, ""),  # nothing is shown yet
         (200, {}, ""),
     ],
 )
 def test_image_of_small_values_is_noted(value: int, policy: dict[str, object], remedy: str) -> None:
-    """Its numbers are not normalised, and nearly equal after the division by 255."""
+    """Its numbers may be codes, and are nearly equal after the division by 255."""
     report = check("map", kwargs={"fault": "map", "value": value})
     assert report.problems == ()
-    assert report.pixel_maxima == {"observation": value}
+    assert report.byte_maxima == {"observation": (value,)}
     chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update=policy)})
-    notes = [text for text in advice(report, chosen, processors=2) if "divides bytes by 255" in text]
-    expected = (
-        "'observation' has no value above 3, and the encoder divides bytes by 255: if it is a map of small numbers, "
-        f"multiply it in a wrapper (--wrap), or use {remedy}"
-    )
-    assert notes == ([expected] if remedy else [])
+    notes = [text for text in advice(report, chosen, processors=2) if "policy.codes" in text]
+    assert [remedy in text for text in notes] == ([True] if remedy else [])
+
+
+def test_minigrids_codes_are_told_from_its_pictures() -> None:
+    """Both are declared as bytes from 0 to 255, and pictures of one pixel a cell have the same shape."""
+    pytest.importorskip("minigrid")
+
+    def codes(**settings: object) -> dict[str, tuple[int, ...]]:
+        spec = EnvironmentSpec.model_validate({"id": "MiniGrid-LavaGapS5-v0", "leave_out": ("mission",), **settings})
+        wrappers = UserModules(frozenset({"minigrid.wrappers"}))
+        report = check_environment(spec, wrappers, seconds=0.0, env_steps=0)
+        assert not report.problems
+        return report.codes
+
+    assert codes() == codes(wrap="minigrid.wrappers:FullyObsWrapper") == {"image": (11, 6, 4)}
+    assert codes(wrap="minigrid.wrappers:RGBImgPartialObsWrapper") == {}
+    assert codes(wrap="minigrid.wrappers:FlatObsWrapper", leave_out=()) == {}
 
 
 @pytest.mark.parametrize(

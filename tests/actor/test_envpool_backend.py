@@ -15,11 +15,15 @@ from daedalus.actor.environments.envpool_backend import EnvpoolEnvironments, mak
 from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", UserWarning)
-    envpool = pytest.importorskip("envpool")
-
 GAS = ((0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (-1.0, 0.5, 0.0), (1.0, 0.0, 0.5))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _installed() -> None:
+    """Import envpool, which takes a second, in one worker only."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        pytest.importorskip("envpool")
 
 
 def _spec(name: str, **fields) -> EnvironmentSpec:
@@ -32,6 +36,8 @@ class _OneByOne:
     def __init__(self, name: str, count: int, seed: int, repeat: int, limit: int) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
+            import envpool
+
             self._pool = envpool.make_gymnasium(name, num_envs=count, num_threads=1, seed=seed, max_episode_steps=limit)
             self.first = self._pool.reset()[0]
         self._repeat = repeat

@@ -12,7 +12,6 @@ from gymnasium.spaces import Box, Discrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
-from pettingzoo.butterfly.knights_archers_zombies import knights_archers_zombies
 from pettingzoo.classic.tictactoe import tictactoe
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
@@ -215,6 +214,8 @@ def tic_tac_toe(*, kept: bool) -> Any:
 
 
 def zombies(*, kept: bool) -> Any:
+    from pettingzoo.butterfly.knights_archers_zombies import knights_archers_zombies  # it asks for no bytecode
+
     game = knights_archers_zombies.env(spawn_delay=5, max_cycles=60)  # agents die early
     return KeptConversion(game) if kept else aec_to_parallel_wrapper(game)
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from daedalus.cli.commands.settings import settings
+from daedalus.cli.commands.settings_command import settings
 from daedalus.protocol.spec import RunSpec
 
 

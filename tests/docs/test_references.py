@@ -8,7 +8,7 @@ import pytest
 from pages import DOCS, ROOT
 
 from daedalus.cli.command_table import COMMANDS, USAGE
-from daedalus.cli.commands.settings import Setting, all_settings
+from daedalus.cli.commands.settings_command import Setting, all_settings
 from daedalus.learner.reporting.metrics_rows import GROUPS
 
 SETTINGS = {setting.path: setting for setting in all_settings()}

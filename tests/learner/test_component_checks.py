@@ -11,7 +11,11 @@ from daedalus.protocol.codec import encode
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 SPACES = Spaces(
-    observations={"numbers": ArraySpace(shape=(3,), dtype="float32", frames=2), "goal": DiscreteSpace(counts=(3, 300))},
+    observations={
+        "numbers": ArraySpace(shape=(3,), dtype="float32", frames=2),
+        "goal": DiscreteSpace(counts=(3, 300)),
+        "map": ArraySpace(shape=(4, 4, 2), dtype="uint8"),
+    },
     actions={
         "grip": DiscreteSpace(counts=(2, 3), masked=True),
         "arm": ContinuousSpace(low=(-1.0, None), high=(1.0, None)),
@@ -31,6 +35,7 @@ def content() -> dict[str, Any]:
         "frames": {
             "numbers": random.standard_normal((ROWS + 2, ENVIRONMENTS, 3), np.float32),
             "goal": random.integers(0, (3, 300), (ROWS + 1, ENVIRONMENTS, 2)).astype(np.uint16),
+            "map": random.integers(0, (2, 5), (ROWS + 1, ENVIRONMENTS, 4, 4, 2)).astype(np.uint8),
         },
         "actions": {"grip": grip, "arm": random.standard_normal((*CELLS, 2), np.float32)},
         "masks": {"grip": masks},
@@ -39,7 +44,9 @@ def content() -> dict[str, Any]:
 
 def verdict_on(changed: dict[str, Any]) -> str:
     """Return why a rollout is rejected, or an empty string."""
-    judge = RolloutJudge(run_spec(), EPOCH, joined_fleet("a", spaces=SPACES))
+    spec = run_spec()
+    spec = spec.model_copy(update={"policy": spec.policy.model_copy(update={"codes": {"map": (2, 5)}})})
+    judge = RolloutJudge(spec, EPOCH, joined_fleet("a", spaces=SPACES))
     verdict = judge.decide("a", judge.read("a", encode(make_rollout(**changed))), 0, 0.0)
     return verdict.reason if isinstance(verdict, Rejected) else ""
 
@@ -66,11 +73,12 @@ def put(kind: str, name: str, place: tuple[int, ...], value: float) -> Any:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda given: given["frames"].pop("goal"), "frames has the components numbers, expected goal, numbers"),
+        (lambda given: given["frames"].pop("goal"), "frames has the components map, numbers, expected goal, map"),
         (lambda given: given["actions"].update(x=given["actions"]["arm"]), "actions has the components arm, grip, x"),
         (lambda given: given["masks"].clear(), "masks has the components none, expected grip"),
         (lambda given: given["masks"].update(grip=np.ones((*CELLS, 4), np.bool_)), "a mask of shape"),
         (put("frames", "goal", (1, 0, 0), 3), "frames/goal has a value outside choices of 3 x 300"),
+        (put("frames", "map", (0, 1, 3, 2, 1), 5), "frames/map has the value 5 in place 1 of its last axis"),
         (put("frames", "numbers", (1, 0, 0), np.nan), "frames/numbers has a value that is not finite"),
         (put("frames", "numbers", (1, 0, 0), 2e15), "frames/numbers has a value beyond"),
         (
@@ -101,7 +109,7 @@ def test_long_names_are_cut_so_that_the_expected_ones_are_readable() -> None:
     given = content()
     given["frames"]["x" * 250_000] = given["frames"]["numbers"]
     reason = verdict_on(given)
-    assert reason == f"frames has the components goal, numbers, {'x' * 64}, expected goal, numbers"
+    assert reason == f"frames has the components goal, map, numbers, {'x' * 64}, expected goal, map, numbers"
 
 
 @pytest.mark.parametrize(("value", "accepted"), [(40.0, True), (40.1, False)])

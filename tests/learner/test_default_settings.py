@@ -7,8 +7,8 @@ import pytest
 from daedalus.learner.run.default_settings import default_settings, kind_of
 from daedalus.learner.run.settings import choose_algorithm, run_spec
 from daedalus.policy.acting.program import export_program
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
@@ -152,3 +152,20 @@ def test_rollouts_of_many_seats_are_no_larger(where: Spaces, seats: int, rows: i
 def test_components_to_leave_out_become_a_setting() -> None:
     assert default_settings(spaces(CHOICES, VECTOR), ["mission"])["environment"]["leave_out"] == ["mission"]
     assert "environment" not in default_settings(spaces(CHOICES, VECTOR))
+
+
+@pytest.mark.parametrize(
+    ("observations", "codes", "kind"),
+    [
+        ((CHOICES, image(7, 7, 3)), {"1": (11, 6, 4)}, "vectors_discrete"),
+        ((image(19, 19, 3),), {"0": (11, 6, 4)}, "vectors_discrete"),
+        ((image(7, 7, 3), image(96, 96, 3)), {"0": (11, 6, 4)}, "images"),
+        ((image(7, 7, 3),), {}, "vectors_discrete"),
+    ],
+)
+def test_codes_are_no_images_and_are_set(
+    observations: tuple[Any, ...], codes: dict[str, tuple[int, ...]], kind: str
+) -> None:
+    where = spaces(CHOICES, *observations)
+    assert PolicySpec.model_validate(default_settings(where, codes=codes)["policy"]).codes == codes
+    assert kind_of(where, codes) == kind

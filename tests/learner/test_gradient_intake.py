@@ -148,7 +148,7 @@ def test_the_largest_observations_that_rollouts_may_have_are_accepted() -> None:
     frames = np.full((ROWS + 1, ENVIRONMENTS, 3), LARGEST_OBSERVATION, np.float32)
     frames[::2] *= -1.0
     rollout = make_rollout(version=VERSION, frames=frames)
-    assert first_component_violation(rollout, SPACES) == ""
+    assert first_component_violation(rollout, SPACES, SPEC.policy) == ""
     actor = RolloutGradients(SPEC.learning, SPACES)
     actor.load(LEARNER.weights() | LEARNER.gradient_inputs(0.0))
     computed = replace(actor.compute(rollout), gradient=GOOD.gradient)

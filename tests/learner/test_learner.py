@@ -412,7 +412,7 @@ def consecutive_rollouts(batch: int, epoch: int = EPOCH, first: int = 0) -> list
 @pytest.mark.parametrize("algorithm", ["a2c", "appo"])
 def test_restored_learner_continues_its_normalisation_identically(algorithm: str, tmp_path: Path) -> None:
     """Actors begin a new learner epoch with sequence number 0: the first return of each then starts from 0."""
-    settings = {"algorithm": algorithm, "normalize_rewards": True, "normalize_advantages": True}
+    settings = {"algorithm": algorithm, "normalize_rewards": True, "normalize_advantages": True, "curiosity": 1.0}
 
     def learn(learner: Learner, batches: range, epoch: int) -> None:
         for batch in batches:
@@ -431,7 +431,7 @@ def test_restored_learner_continues_its_normalisation_identically(algorithm: str
     learn(second, range(5, 10), EPOCH + 1)
 
     assert_same(weights(through), weights(second))
-    assert {"observations/observation/mean", "returns/squares"} <= state.keys()
+    assert {"observations/observation/mean", "returns/squares", "curiosity/squares"} <= state.keys()
     assert second.state().keys() == state.keys()
     for name, value in second.state().items():
         assert torch.equal(value, state[name]), name

@@ -1,8 +1,11 @@
 """learner/reporting/learning_hints.py: a run that does not learn says so, once."""
 
+from typing import Any
+
 import pytest
 
 from daedalus.learner.reporting.learning_hints import LearningHint
+from daedalus.protocol.spec import TrainingSpec
 
 
 def row(
@@ -20,8 +23,8 @@ def row(
     }
 
 
-def hints(*rows: dict[str, float], normalizes_rewards: bool = False) -> list[str]:
-    hint, taken = LearningHint(1000, normalizes_rewards=normalizes_rewards), []
+def hints(*rows: dict[str, float], **training: Any) -> list[str]:
+    hint, taken = LearningHint(TrainingSpec(env_steps=1000, **training)), []
     for each in rows:
         hint.add(each)
         taken.append(hint.take())
@@ -72,7 +75,7 @@ def test_run_whose_critic_explains_nothing_gets_a_hint() -> None:
     *before, last = hints(row(0.01, 0.0, 1.0, -5.0), *watched)
     assert set(before) == {""}
     assert "the explained variance of the value stays below 0; try training.normalize_rewards=true" in last
-    normalizing = hints(row(0.01, 0.0, 1.0, -5.0), *watched, normalizes_rewards=True)[-1]
+    normalizing = hints(row(0.01, 0.0, 1.0, -5.0), *watched, normalize_rewards=True)[-1]
     assert normalizing.endswith("stays below 0; try a smaller training.learning_rate")
     watched[3]["explained_variance"] = 0.1
     assert set(hints(row(0.01, 0.0, 1.0), *watched)) == {""}
@@ -89,6 +92,8 @@ def test_run_whose_returns_are_all_equal_gets_a_hint_of_its_own(entropy: float) 
     *before, last = hints(equal(0.01), *watched)
     assert set(before) == {""}
     assert last.startswith("this run has nothing to learn from: every episode so far has the return -200, so")
+    assert last.endswith("reach the goal; training.curiosity=1 explores more, where observations come back")
+    assert hints(equal(0.01), *watched, curiosity=0.5)[-1].endswith("whether random actions can reach the goal")
     watched[2]["episode_return_max"] = -199.0
     assert "every episode" not in hints(equal(0.01), *watched)[-1]
 

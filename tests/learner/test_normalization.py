@@ -9,7 +9,7 @@ import torch
 from building import POLICY, identity, join, make_rollout
 from plain import NAME, plain
 
-from daedalus.algorithms import normalization, running_returns
+from daedalus.algorithms import normalization
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.normalization import (
     ConfirmedRanges,
@@ -20,10 +20,10 @@ from daedalus.algorithms.normalization import (
     moments_of,
     observations_name,
 )
-from daedalus.algorithms.running_returns import RunningReturns
+from daedalus.algorithms.running_returns import Streams
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
-from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 from daedalus.protocol.uploads import Rollout
@@ -213,14 +213,18 @@ def test_returns_run_on_over_rows_that_a_client_does_not_send() -> None:
     assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
 
 
-def test_running_returns_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running_returns, "_MAX_STREAMS", 2)
-    returns = RunningReturns(DISCOUNT)
-    for rollout in [sent(0, actor) for actor in "abc"]:
-        returns.add(rollout)
-    assert [stream.actor for stream in returns._running] == ["b", "c"]
-    returns.add(sent(1, "b"))
-    assert [stream.actor for stream in returns._running] == ["c", "b"]
+def test_owner_of_the_largest_streams_forgets_the_first_of_them() -> None:
+    streams = Streams[int](most=6)
+    for number, actor in enumerate(["small", "large.0", "large.1"]):
+        streams.put(make_rollout(identity(actor, 0)), number, size=2)
+    assert not streams.has_forgotten
+    streams.put(make_rollout(identity("large.2", 0)), 3, size=4)  # the first two of this owner are enough
+    assert streams.has_forgotten
+    assert [streams.take(make_rollout(identity(f"large.{index}", 1))) for index in range(3)] == [None, None, 3]
+    streams.put(make_rollout(identity("huge", 0)), 4, size=7)  # more than all may have
+    assert streams.take(make_rollout(identity("huge", 1))) is None
+    assert streams.take(make_rollout(identity("small", 1))) == 0
+    assert streams.take(make_rollout(identity("small", 1))) is None
 
 
 def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None:

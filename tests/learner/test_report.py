@@ -11,6 +11,7 @@ import pytest
 from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_context, run_spec
 from league_statuses import LEAGUE
 
+from daedalus.algorithms import curiosity
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.learning_hints import EpisodeHint
 from daedalus.learner.reporting.metrics_rows import COLUMNS, Details
@@ -131,7 +132,7 @@ def test_row_has_every_column_when_all_values_are_known() -> None:
     reporter = RunReporter(context, UserMetrics())
     counters.trained([make_rollout(version=3, valid=EVERYTHING)], 5, 1)
     context.evaluations.newest = {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
-    row = reporter.row(learner_with(dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5)), 11.0)
+    row = reporter.row(learner_with(dict.fromkeys((*METRICS, *DIAGNOSTICS, *curiosity.METRICS), 0.5)), 11.0)
     assert set(row) == set(COLUMNS) - {"agent_steps", "rating", "rating_deviation"}  # of games only
     assert (row["wall_seconds"], row["env_steps"], row["updates"]) == (9.5, 36, 2)
     assert (row["actors"], row["rollouts_rejected"], row["policy_lag_max"]) == (1, 3, 2)

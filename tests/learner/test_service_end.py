@@ -17,7 +17,7 @@ from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.learner.reporting import recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run import heartbeat
-from daedalus.learner.serving import actor_server, orders, run_context
+from daedalus.learner.serving import actor_server, received_orders, run_context
 from daedalus.learner.training import checkpointer
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.policy.saving.saved_policy import checkpoints
@@ -185,7 +185,7 @@ def test_training_goes_on_and_a_learner_ends_while_its_disk_does_not_answer(
     monkeypatch.setattr(recorder, "_CLOSE_SECONDS", 0.1)
     monkeypatch.setattr(heartbeat, "_END_SECONDS", 0.1)
     monkeypatch.setattr(run_context, "SLOW_DISK_SECONDS", 0.0)
-    monkeypatch.setattr(orders, "_ANSWER_SECONDS", 0.05)
+    monkeypatch.setattr(received_orders, "_ANSWER_SECONDS", 0.05)
     operator = MemoryTransport(network)
 
     def order() -> Acknowledgement:

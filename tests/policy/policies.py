@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from plain import array_space, plain_spaces
+from plain import NAME, array_space, plain_spaces
 
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
@@ -81,6 +81,11 @@ POLICIES: dict[str, tuple[dict[str, Any], Spaces]] = {
     "bytes": ({"hidden": (24, 24)}, spaces((5, 5))),
     "stacked numbers": ({"hidden": (24,)}, spaces((3,), "float32", frames=3)),
     "one action": ({"hidden": (3,)}, spaces((1,), "float32", actions=1)),
+    "grid": ({"encoder": "grid", "hidden": (24,), "activation": "relu"}, spaces((6, 5, 9), "float32", actions=3)),
+    "grid, stacked": ({"encoder": "grid", "hidden": (8,)}, spaces((4, 7, 2), "float32", frames=2)),
+    "bytes, grid, gru": ({"encoder": "grid", "hidden": (8,)} | _GRU, spaces((3, 3, 4))),
+    "codes": ({"codes": {NAME: (256,)}, "hidden": (16,)}, spaces((3, 2), frames=2)),
+    "codes, grid": ({"codes": {NAME: (256, 256)}, "encoder": "grid", "hidden": (8,)}, spaces((6, 5, 2))),
     "mlp, gru": ({"hidden": (16,)} | _GRU, spaces((4,), "float32")),
     "gru alone": ({"hidden": ()} | _GRU, spaces((4,), "float32")),
     "small": ({"encoder": "small"}, spaces((84, 84), frames=4, actions=6)),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
-from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.compact import bfloat16, float32
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
@@ -64,6 +64,8 @@ IMAGE = ArraySpace(shape=(16, 16, 3), dtype="uint8")
         ("impala", {"bytes": BYTES}, set()),  # its first convolution scales bytes itself
         ("impala", {"numbers": NUMBERS}, {"numbers"}),
         ("impala", {"bytes": BYTES, "image": IMAGE}, {"bytes"}),  # the multilayer perceptron reads them
+        ("auto", {"coded": BYTES, "bytes": BYTES}, {"bytes"}),
+        ("grid", {"map": BYTES, "bytes": ArraySpace(shape=(4,), dtype="uint8")}, {"bytes"}),
         ("module:Own", {"bytes": BYTES}, set()),
         ("module:Own", {"bytes": BYTES, "numbers": NUMBERS, "choice": DiscreteSpace(counts=(3,))}, {"numbers"}),
     ],
@@ -71,5 +73,7 @@ IMAGE = ArraySpace(shape=(16, 16, 3), dtype="uint8")
 def test_bytes_are_normalised_for_the_multilayer_perceptron_only(
     encoder: str, spaces: dict[str, ArraySpace | DiscreteSpace], normalized: set[str]
 ) -> None:
-    assert set(normalized_components(PolicySpec(encoder=encoder, normalize_observations=True), spaces)) == normalized
+    codes = {"coded": (5,)} if "coded" in spaces else {}
+    policy = PolicySpec(encoder=encoder, codes=codes, normalize_observations=True)
+    assert set(normalized_components(policy, spaces)) == normalized
     assert not normalized_components(PolicySpec(encoder=encoder), spaces)

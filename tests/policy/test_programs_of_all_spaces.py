@@ -20,7 +20,7 @@ ROWS = 5
 
 arrays = st.builds(
     ArraySpace,
-    shape=st.sampled_from([(1,), (3,), (2, 3), (20, 18)]),
+    shape=st.sampled_from([(1,), (3,), (2, 3), (6, 5, 2), (20, 18)]),
     dtype=st.sampled_from(["float32", "uint8"]),
     frames=st.sampled_from([1, 2]),
 )
@@ -89,8 +89,22 @@ def built(
 
 
 @settings(max_examples=12, phases=(Phase.generate,))  # shrinking would export a program for each step
-@given(spaces=all_spaces, spec=policies, seed=st.integers(0, 2**20), greedy=st.booleans(), explores=st.booleans())
-def test_program_acts_as_torch_does(spaces: Spaces, spec: PolicySpec, seed: int, greedy: bool, explores: bool) -> None:
+@given(
+    spaces=all_spaces,
+    spec=policies,
+    seed=st.integers(0, 2**20),
+    greedy=st.booleans(),
+    explores=st.booleans(),
+    coded=st.booleans(),
+)
+def test_program_acts_as_torch_does(
+    spaces: Spaces, spec: PolicySpec, seed: int, greedy: bool, explores: bool, coded: bool
+) -> None:
+    arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
+    if coded:
+        codes = {name: (256,) for name, space in arrays.items() if space.dtype == "uint8"}
+        maps = any(len(space.shape) == 3 for space in arrays.values())
+        spec = spec.model_copy(update={"codes": codes, "encoder": "grid" if maps else "mlp"})
     torch.manual_seed(seed)
     random = np.random.default_rng(seed)
     bounded = all(isinstance(space, DiscreteSpace) or space.bounded for space in spaces.actions.values())

@@ -149,6 +149,7 @@ OUT_OF_RANGE: dict[type[Specification], dict[str, list[Any]]] = {
         "value_coefficient": [-0.1],
         "entropy_bonus": [-0.1],
         "entropy_bonus_final": [-0.1],
+        "curiosity": [-0.1, 101.0],
         "optimizer": ["sgd"],
         "learning_rate": [0.0, 1.1, math.nan],
         "learning_rate_final": [-0.1],

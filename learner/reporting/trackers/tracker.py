@@ -15,12 +15,8 @@ from daedalus.policy.user_modules import UserModules, modules_of
 PROJECT = "daedalus"  # project or experiment of the runs, unless the tracker's environment variable names another
 SUMMARY = "summary/"  # prefix of the results of a run
 
-# The class of each tracker, and the package that it needs. The extra in pyproject.toml has the tracker's name.
-_CLASSES = {
-    "wandb": ("wandb_tracker", "WandbTracker"),
-    "mlflow": ("mlflow_tracker", "MlflowTracker"),
-    "trackio": ("trackio_tracker", "TrackioTracker"),
-}
+# The class of each tracker in known_trackers.py. Its package and the extra in pyproject.toml have the tracker's name.
+_CLASSES = {"wandb": "WandbTracker", "mlflow": "MlflowTracker", "trackio": "TrackioTracker"}
 TRACKERS = tuple(_CLASSES)
 _OPTION = "--log"
 
@@ -76,8 +72,7 @@ def tracker_class(name: str) -> OpenTracker:
         modules = UserModules(frozenset(modules_of({_OPTION: name})))
         kind = modules.attribute(_OPTION, name)
         return lambda run: OwnWriter(name, kind(run))
-    module, of = _CLASSES[name]
-    return getattr(importlib.import_module(f"daedalus.learner.reporting.trackers.{module}"), of)
+    return getattr(importlib.import_module("daedalus.learner.reporting.trackers.known_trackers"), _CLASSES[name])
 
 
 class OwnWriter:

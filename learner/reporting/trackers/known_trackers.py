@@ -1,7 +1,8 @@
-"""Tracker for MLflow. It uses the client, whose calls raise exceptions, and none of MLflow's global state."""
+"""Trackers for Weights & Biases, MLflow and Trackio. Each imports its package when it is opened."""
 
 import os
 import re
+import secrets
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -10,7 +11,59 @@ from typing import Any
 
 from daedalus.learner.reporting.metrics_rows import Details
 from daedalus.learner.reporting.trackers.tracker import PROJECT, SUMMARY, TrackedRun, flat, tagged
+from daedalus.policy.user_code import message_line
 from daedalus.protocol.texts import without_secrets
+
+_INIT_SECONDS = 30.0  # for the server to answer
+
+
+class WandbTracker:
+    """Run at Weights & Biases, or in its local files if the user is not logged in or the server does not answer.
+
+    Steps are env_steps. Weights & Biases drops a row with fewer steps than the row before.
+    """
+
+    def __init__(self, run: TrackedRun) -> None:
+        os.environ.setdefault("WANDB_PROJECT", PROJECT)
+        import wandb  # takes a second
+        from wandb.errors import Error
+
+        def begin(mode: Any) -> Any:
+            return wandb.init(
+                id=self.id,
+                name=os.environ.get("WANDB_NAME", run.name),
+                resume="allow",
+                dir=os.environ.get("WANDB_DIR", str(run.directory)),
+                config=dict(run.settings),
+                allow_val_change=True,  # `daedalus resume --set` changes settings
+                mode=mode,
+                settings=wandb.Settings(silent=True, console="off", init_timeout=_INIT_SECONDS),
+            )
+
+        self.id = run.id or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
+        fault = ""
+        try:
+            self._run = begin(None)  # WANDB_MODE, or online
+        except Error as error:
+            fault = f"{message_line(error).rstrip('.')}; "
+            self._run = begin("offline")
+        if self._run.offline:
+            self.place = f"{fault}recorded offline; upload the run with: wandb sync {self._run.settings.sync_dir}"
+        else:
+            self.place = self._run.url or "disabled"
+
+    def write(self, row: Mapping[str, float], details: Details) -> None:
+        """See Tracker."""
+        self._run.log(tagged(row), step=int(row["env_steps"]))
+
+    def summarize(self, summary: Mapping[str, Any]) -> None:
+        """See Tracker."""
+        self._run.summary.update({SUMMARY + name: value for name, value in summary.items()})
+
+    def close(self) -> None:
+        """See MetricsWriter."""
+        self._run.finish()
+
 
 # MLflow's own defaults make a call to a server that does not answer last for many minutes.
 _HTTP = {"MLFLOW_HTTP_REQUEST_TIMEOUT": "20", "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1"}
@@ -21,6 +74,8 @@ _LONGEST = 5000  # characters of a value; MLflow's limit is 6000 for parameters 
 
 class MlflowTracker:
     """Run at the tracking server of MLFLOW_TRACKING_URI, or in MLflow's local database (mlflow.db).
+
+    It uses the client, whose calls raise exceptions, and none of MLflow's global state.
 
     Parameters are the settings at the first start. Settings that `daedalus resume` changes become tags, because MLflow
     does not allow other values for parameters.
@@ -107,3 +162,30 @@ class MlflowTracker:
 def _parameter_name(setting: str) -> str:
     """Return a name of characters that MLflow takes. Arguments of an environment may have any names."""
     return re.sub(r"[^\w.\- :]", "_", setting)[:_LONGEST_NAME]
+
+
+class TrackioTracker:
+    """Run in Trackio's local database, or at the Space of TRACKIO_SPACE_ID."""
+
+    def __init__(self, run: TrackedRun) -> None:
+        import trackio  # pyright: ignore[reportMissingImports]  # takes seconds
+
+        # Trackio finds a run by its name. Two run directories may have the same name.
+        self.id = run.id or f"{run.name}-{secrets.token_hex(2)}"
+        project = os.environ.get("TRACKIO_PROJECT", PROJECT)
+        self._run = trackio.init(project=project, name=self.id, config=dict(run.settings), resume="allow")
+        self._env_steps = 0
+        self.place = f"run {self.id}; show it with: trackio show --project {project}"
+
+    def write(self, row: Mapping[str, float], details: Details) -> None:
+        """See Tracker."""
+        self._env_steps = int(row["env_steps"])
+        self._run.log(tagged(row), step=self._env_steps)
+
+    def summarize(self, summary: Mapping[str, Any]) -> None:
+        """See Tracker."""
+        self._run.log({SUMMARY + name: value for name, value in summary.items()}, step=self._env_steps)
+
+    def close(self) -> None:
+        """See MetricsWriter."""
+        self._run.finish()

@@ -1,0 +1,138 @@
+"""Curiosity: a reward for observations that are new in their episode. State; no threads."""
+
+import logging
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.normalization import RewardNormalizer
+from daedalus.algorithms.running_returns import Streams
+from daedalus.protocol.uploads import Rollout
+
+METRICS = ("first_visit_fraction", "curiosity_reward_mean")
+_MOST_OBSERVATIONS = 2_000_000  # of all running episodes together, about 200 MB
+_JUDGED_ROWS = 4096  # the first ones
+_MOST_NEW = 0.95  # share of first visits, above which observations do not come back
+
+_logger = logging.getLogger(__name__)
+
+
+class FirstVisits:
+    """The observations that the running episodes have had, and so which rows lead to one that is new in its episode.
+
+    Two observations are the same if their newest frames have the same bytes. An episode goes on from rollout to rollout
+    of its environment. One whose earlier rollouts are not known, because they were dropped or came before a restart of
+    the learner, begins without observations.
+    """
+
+    def __init__(self, *, synchronous: bool = False) -> None:
+        """Construct it. `synchronous`: whether the run makes its actors wait for each update."""
+        self._streams = Streams[list[set[int]]](synchronous=synchronous, most=_MOST_OBSERVATIONS)
+        self._has_warned = False
+
+    def add(self, rollout: Rollout) -> np.ndarray:
+        """Return 1 for the rows whose next observation is new in its episode, else 0: float32 [T, E].
+
+        It is 0 for reset rows. Call once for each rollout, in order.
+        """
+        seen = self._streams.take(rollout)
+        if seen is None or len(seen) != rollout.environments:
+            seen = [set[int]() for _ in range(rollout.environments)]
+        codes = _codes(rollout)
+        first = np.zeros(rollout.rewards.shape, np.float32)
+        for environment, known in enumerate(seen):
+            known.add(codes[0][environment])
+            for row in range(rollout.rows):
+                code = codes[row + 1][environment]
+                if not rollout.valid[row, environment]:  # the next observation is the first of another episode
+                    known.clear()
+                elif code not in known:
+                    first[row, environment] = 1.0
+                known.add(code)
+        self._streams.put(rollout, seen, size=sum(map(len, seen)))
+        if self._streams.has_forgotten and not self._has_warned:
+            self._has_warned = True
+            _logger.warning(
+                "curiosity remembers at most %s observations of all running episodes, and has forgotten those of some "
+                "environments: their next rollouts are rewarded as if their episodes began there",
+                f"{_MOST_OBSERVATIONS:,}",
+            )
+        return first
+
+
+def _codes(rollout: Rollout) -> list[list[int]]:
+    """Return a checksum of the newest frames of each row and environment, [T+1][E]."""
+    rows = rollout.rows + 1
+    codes = [[0] * rollout.environments for _ in range(rows)]
+    for frames in rollout.frames.values():
+        for row, newest in zip(codes, frames[len(frames) - rows :], strict=True):
+            for environment, frame in enumerate(newest):
+                row[environment] = zlib.crc32(frame.tobytes(), row[environment])
+    return codes
+
+
+class Curiosity:
+    """Rewards for first visits, which the learner adds to those of the environment.
+
+        b_t = w / d if s_{t+1} is new in its episode, else 0
+
+    with a weight w, and d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for
+    the rewards of the environment (RewardNormalizer). Where each episode has another map, this term alone explores as
+    well as together with the prediction errors that it was added to at first: Wang et al. (2023), "Revisiting Intrinsic
+    Reward for Exploration in Procedurally Generated Environments".
+    """
+
+    def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:
+        """Construct it. `synchronous`: whether the run makes its actors wait for each update."""
+        self._visits = FirstVisits(synchronous=synchronous)
+        self._scale = RewardNormalizer(discount_factor, synchronous=synchronous)
+        self._newest: dict[Rollout, np.ndarray] = {}  # first visits of the newest batch
+        self._factor = 0.0  # w / d
+        self._rows = self._new = 0  # among the first rows; it has judged them if there are enough
+
+    @property
+    def statistics(self) -> dict[str, Tensor]:
+        """The running scale, for a checkpoint, by name; restored in place."""
+        return self._scale.moments.state()
+
+    def look(self, rollouts: Sequence[Rollout], weight: float) -> None:
+        """Look at the rollouts of a new batch, in order. Their rewards are kept until the next call."""
+        self._newest = {each: self._visits.add(each) for each in rollouts}
+        counted = [replace(each, rewards=first) for each, first in self._newest.items()]
+        self._scale.moments.merge(self._scale.moments_of(counted))
+        self._factor = weight / self._scale.divisor
+        if self._rows < _JUDGED_ROWS:
+            self._judge()
+
+    def add_to(self, batch: Batch, rollouts: Sequence[Rollout]) -> None:
+        """Add the rewards of rollouts to those of their batch in place. Rollouts not looked at have none."""
+        column = 0
+        for rollout in rollouts:
+            if (first := self._newest.get(rollout)) is not None:
+                batch.rewards[:, column : column + rollout.environments] += torch.from_numpy(first) * self._factor
+            column += rollout.environments
+
+    def metrics(self) -> dict[str, float]:
+        """Return METRICS, means over the rows to learn from of the newest batch; empty without such rows."""
+        learned = [first[each.learned] for each, first in self._newest.items()]
+        if not sum(map(len, learned)):
+            return {}
+        share = float(np.concatenate(learned).mean())
+        return dict(zip(METRICS, (share, share * self._factor), strict=True))
+
+    def _judge(self) -> None:
+        """Warn once, after enough rows, if observations do not come back."""
+        self._rows += sum(int(each.learned.sum()) for each in self._newest)
+        self._new += sum(int(first[each.learned].sum()) for each, first in self._newest.items())
+        if self._rows >= _JUDGED_ROWS and self._new > _MOST_NEW * self._rows:
+            _logger.warning(
+                "training.curiosity hardly tells rows apart: %.0f %% of them lead to an observation that is new in its "
+                "episode, so that it rewards little but long episodes. Set training.curiosity=0, or let "
+                "environment.wrap round the observations or leave out what always changes, such as a clock",
+                100.0 * self._new / self._rows,
+            )
