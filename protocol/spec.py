@@ -656,7 +656,7 @@ class RunSpec(Specification):
             )
         if self.training.curiosity:
             raise ValueError(
-                f"training.curiosity is for algorithms that learn from new rollouts, but {name} learns from rewards in a "
+                f"training.curiosity is for algorithms that learn from new rollouts, but {name} keeps rewards in a "
                 "replay buffer, where they would not fade: set training.curiosity=0"
             )
         return self
