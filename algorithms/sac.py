@@ -73,13 +73,16 @@ class Sac(Algorithm):
 
     record = ALGORITHMS["sac"]
 
-    def build(self, critics: TwinCritics, network: ActorCritic, learned: FlatParameters, *, is_mixed: bool) -> None:
+    def build(
+        self, critics: TwinCritics, network: ActorCritic, learned: FlatParameters, *, target_rate: float, is_mixed: bool
+    ) -> None:
         """Begin with these critics, and a temperature of 1, before the first update.
 
         Args:
           critics: on the device of the network.
           network: the policy.
           learned: its parameters that have gradients.
+          target_rate: share of the way that the target critics move to the critics at each update.
           is_mixed: whether forward passes compute in bfloat16.
         """
         device = learned.values.device
@@ -89,7 +92,7 @@ class Sac(Algorithm):
         self._targets = FlatParameters(self._target_critics.parameters()).values
         self._log_temperature = torch.zeros(1, device=device)
         self._actions = self.distribution.normal_count  # D
-        self._is_mixed = is_mixed
+        self._target_rate, self._is_mixed = target_rate, is_mixed
         self._recorder = OperationRecorder()
         self._records = device.type == "cpu" and not network.convolutional and not network.has_user_modules
         # What optimisers change, besides the policy.
@@ -158,5 +161,5 @@ class Sac(Algorithm):
         return torch.autocast(device, torch.bfloat16) if self._is_mixed else nullcontext()
 
     def after_update(self, policy_version: int, forward: Forward) -> None:
-        """See Algorithm: move the target critics by `training.target_rate` of the way to the critics."""
-        self._targets.lerp_(self._flat.values, self.spec.target_rate)
+        """See Algorithm: move the target critics by `target_rate` of the way to the critics."""
+        self._targets.lerp_(self._flat.values, self._target_rate)

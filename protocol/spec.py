@@ -257,8 +257,6 @@ class LossSpec(Specification):
     `newest`. `appo` only."""
     target_period: PositiveInt = 100
     """Updates between two copies of the network to the target network, where the algorithm has one."""
-    target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
-    """Share of the way that the target critics move to the critics at each update; `sac` only."""
 
     exploration: Epsilons | None = None
     """Epsilons: each actor draws one, by the seed and its name, and takes a random legal action with that probability.
@@ -357,6 +355,8 @@ class TrainingSpec(LossSpec):
     """Transitions that each update learns from, drawn uniformly from the replay buffer."""
     n_step: Annotated[int, Field(ge=1, le=64)] = 1
     """Rewards in the target of a transition before it bootstraps; fewer at the end of an episode or a rollout."""
+    target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
+    """Share of the way that the target critics move to the critics at each update."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
 

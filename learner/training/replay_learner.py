@@ -43,7 +43,7 @@ class ReplayLearner(Learner):
         assert isinstance(algorithm, Sac)
         mixed = is_mixed(spec.precision, self.device, self._network.convolutional)
         critics = TwinCritics(run.policy, spaces, modules).to(self.device)
-        algorithm.build(critics, self._network, self._flat, is_mixed=mixed)
+        algorithm.build(critics, self._network, self._flat, target_rate=spec.target_rate, is_mixed=mixed)
         self._algorithm = algorithm
         self._learned = {"policy": self._flat.values, **algorithm.learned}
         self._optimizers = {

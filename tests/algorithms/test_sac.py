@@ -44,7 +44,7 @@ class Built:
         assert isinstance(computer.algorithm, Sac)
         self.sac, self.learned = computer.algorithm, computer.parameters
         self.critics = TwinCritics(POLICY, SPACES, NO_MODULES)
-        self.sac.build(self.critics, self.network, self.learned, is_mixed=False)
+        self.sac.build(self.critics, self.network, self.learned, target_rate=spec.target_rate, is_mixed=False)
         self.sac.statistics["target_critics"].add_(torch.randn_like(self.sac.statistics["target_critics"]) * 0.1)
         self.sac.learned["log_temperature"].fill_(math.log(0.3))
 
