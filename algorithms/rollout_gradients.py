@@ -114,6 +114,7 @@ class RolloutGradients:
             episode_returns=rollout.episode_returns,
             episode_lengths=rollout.episode_lengths,
             episode_info=rollout.episode_info,
+            lessons=rollout.lessons,
         )
         return gradient if self._in_float32 else self._rounded(gradient)
 

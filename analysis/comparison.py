@@ -113,9 +113,10 @@ def _finite(env_steps: np.ndarray) -> int | None:
 
 def training_tasks(groups: Sequence[Group]) -> set[str]:
     """Return what makes the tasks that the runs train on differ from those of their evaluations, as texts."""
-    played = [run.environment for group in groups for run in group.runs if run.environment is not None]
+    played = [(run, run.environment) for group in groups for run in group.runs if run.environment is not None]
     return {
-        "" if task.trains_true_task else value_text([task.training_kwargs, task.no_reward_limit]) for task in played
+        "" if run.trains_true_task else value_text([task.training_kwargs, task.no_reward_limit, run.lessons])
+        for run, task in played
     }
 
 
@@ -126,8 +127,8 @@ def incomparable_returns(groups: Sequence[Group]) -> str:
     if not without or len(training_tasks(groups)) < 2:
         return ""
     return (
-        "final returns cannot be compared: training plays different tasks (environment.training_kwargs or "
-        "environment.no_reward_limit) and not all runs were evaluated; evaluate them, such as with: "
+        "final returns cannot be compared: training plays different tasks (environment.training_kwargs, "
+        "environment.no_reward_limit or lessons) and not all runs were evaluated; evaluate them, such as with: "
         f"{without[0].record_command}"
     )
 
@@ -223,7 +224,8 @@ def notes(comparison: Comparison) -> list[str]:
     if comparison.other_task and comparison.threshold is not None:
         lines.append(
             "reached, env_steps and minutes: by evaluations during training (evaluation.seconds; -: there were none), "
-            "because training plays another task (environment.training_kwargs or environment.no_reward_limit)"
+            "because training plays another task (environment.training_kwargs, environment.no_reward_limit or "
+            "lessons)"
         )
     if comparison.unnamed:
         lines.append(f"the groups also differ in {', '.join(comparison.unnamed)}")

@@ -147,7 +147,12 @@ class RecordedRun:
     @property
     def trains_true_task(self) -> bool:
         """Whether its training returns can be compared with those of evaluations."""
-        return self.environment is None or self.environment.trains_true_task
+        return not self.lessons and (self.environment is None or self.environment.trains_true_task)
+
+    @property
+    def lessons(self) -> dict[str, Any]:
+        """Settings of the lessons, by parameter."""
+        return {key.partition(".")[2]: value for key, value in self.settings.items() if key.startswith("lessons.")}
 
     def reached(self, threshold: float, *, evaluated: bool = False) -> tuple[float, float]:
         """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.

@@ -29,7 +29,7 @@ from daedalus.analysis.run_results import (
     together,
     written,
 )
-from daedalus.learner.reporting.metrics_rows import ENV, USER, WIN_RATE
+from daedalus.learner.reporting.metrics_rows import ENV, LESSON, USER, WIN_RATE
 from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.settings import changed_settings, setting_text, value_text
 from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
@@ -556,7 +556,7 @@ def _curves(groups: Sequence[Group], by: str, of: str = "") -> ET.Element | None
     `of` tells charts of the page apart.
     """
     columns = {name for group in groups for run in group.runs for name in run.metrics}
-    own = sorted(name for name in columns if name.startswith((ENV, USER, WIN_RATE)))[:_MOST_OWN]
+    own = sorted(name for name in columns if name.startswith((ENV, USER, WIN_RATE, LESSON)))[:_MOST_OWN]
     charts = []
     for column, title in {**_TITLES, **{name: title_of(name) for name in own}}.items():
         lines, colours = _lines(groups, column, by)

@@ -201,7 +201,7 @@ def score(run: PlannedRun) -> float:
         return final
     if summary["solved"]:
         return 1.0 - summary["env_steps"] / training.env_steps
-    trained = summary["episode_return_mean"] if run.spec.environment.trains_true_task else None
+    trained = summary["episode_return_mean"] if run.spec.trains_true_task else None
     mean = final if trained is None else trained
     return -max(training.target_return - mean, 0.0) / max(abs(training.target_return), 1.0)
 

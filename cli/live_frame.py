@@ -69,6 +69,8 @@ def _run(run: WatchedRun, width: int, lines: int, ascii_only: bool) -> list[Rend
     status = run.status
     notes = [_line([f"PROBLEM: {problem}"], width, "yellow") for problem in status.problems[:_SHOWN_PROBLEMS]]
     notes += [_line([status.bottleneck], width)] if status.bottleneck else []
+    lessons = [f"{name} {text}" for name, text in status.lessons.items()]
+    notes += [_line(["lessons:", *lessons], width)] if lessons else []
     rates = [f"{name} {rate:.0%}" for name, rate in status.league.win_rates.items()] if status.league else []
     notes += [_line(["newest wins against", *rates], width)] if rates else []
     lines = max(lines - len(notes), 0)

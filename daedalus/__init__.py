@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from daedalus.learner.run.run_files import RunDataError
     from daedalus.learner.run.settings import SettingsError
     from daedalus.policy.saving.hub import HubError
+    from daedalus.policy.saving.onnx_graph import ExportError
     from daedalus.policy.saving.saved_policy import NoPolicyError
     from daedalus.policy.saving.sealed import DamagedError
 
@@ -35,6 +36,7 @@ __all__ = [
     "Decisions",
     "EnvironmentSetupError",
     "EvaluationResult",
+    "ExportError",
     "HubError",
     "MatchScore",
     "MatchScores",
@@ -61,6 +63,7 @@ _MODULES = {
     "DamagedError": "daedalus.policy.saving.sealed",
     "EnvironmentSetupError": "daedalus.actor.environments.environment_errors",
     "EvaluationResult": "daedalus.launch.evaluation",
+    "ExportError": "daedalus.policy.saving.onnx_graph",
     "HubError": "daedalus.policy.saving.hub",
     "MatchScore": "daedalus.launch.match_evaluation",
     "MatchScores": "daedalus.launch.match_evaluation",

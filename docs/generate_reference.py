@@ -29,7 +29,7 @@ PYTHON_API = {
     "Use a trained policy": (
         *("evaluate", "EvaluationResult", "MatchScores", "MatchScore"),
         *("load_policy", "Policy", "Decisions", "NoPolicyError", "DamagedError"),
-        *("EnvironmentSetupError", "HubError", "VideoError"),
+        *("EnvironmentSetupError", "ExportError", "HubError", "VideoError"),
     ),
     "Client": ("Client", "daedalus.actor.collecting.client_agent.ClientAgent"),
     "Transport": tuple(f"daedalus.transport.interface.{name}" for name in ("Transport", "Request", "Inbox")),

@@ -6,8 +6,9 @@
 
 Without a bonus for entropy, a policy that only meets itself goes round in a circle: from rock to paper, from paper to
 scissors, from scissors to rock, until it no longer tries anything else. The matrix of its versions shows that each
-beats some of the others and loses to some, so that no rating tells them apart. With past versions among the opponents
-(leave out league.past_share), the policy must answer each of them.
+beats some of the others and loses to some, so that no rating tells them apart. With past versions among the
+opponents (leave out league.past_share), habits that one of them punishes pay less; without entropy the newest policy
+still ends as a habit.
 """
 
 from typing import Any

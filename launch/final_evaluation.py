@@ -82,8 +82,8 @@ def sampled_note(greedy: dict[str, Any], sampled: dict[str, Any]) -> str:
 def other_task_note(training_mean: float) -> str:
     """Return a message about the mean return of training episodes of another task than that of evaluations."""
     return (
-        f"the return {short_number(training_mean)} of training is that of another task (environment.training_kwargs or "
-        "environment.no_reward_limit): it cannot be compared with evaluations"
+        f"the return {short_number(training_mean)} of training is that of another task (environment.training_kwargs, "
+        "environment.no_reward_limit or lessons): it cannot be compared with evaluations"
     )
 
 
@@ -222,7 +222,7 @@ class FinalEpisodes:
         ((evaluation, report),) = self.play(best, backend, _FINAL_SEEDS, spec.evaluation.actions)
         confirmed = summary.get("confirmation") is not None  # by sampled episodes
         can_differ = spec.algorithm.heads != "action_values"  # whose policy is always greedy
-        true_task, trained = spec.environment.trains_true_task, summary.get("episode_return_mean")
+        true_task, trained = spec.trains_true_task, summary.get("episode_return_mean")
         if not true_task and trained is not None:
             evaluation["notes"].append(other_task_note(trained))
         if true_task and not confirmed and can_differ and is_below_training(evaluation, trained):

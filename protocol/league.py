@@ -75,8 +75,8 @@ class PlannedRating(Specification):
 
 
 class Plan(Specification):
-    """Whom an actor lets play. It draws the opponent of each match from the plan that it has, so that it needs no
-    answer of the learner between two matches."""
+    """Whom an actor lets play. It draws opponents from the plan that it has, so that it needs no answer of the
+    learner between two matches. The training matches that begin in a rollout may have the same opponent."""
 
     revision: NaturalInt = 0  # increases with each change within a learner epoch
     training: Annotated[tuple[PlannedOpponent, ...], Field(max_length=_MAX_PLAYERS)] = ()

@@ -7,13 +7,15 @@ messages, keys.py names the keys that they use, and the learner's intake decides
 import hashlib
 import math
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from daedalus.protocol import keys
 from daedalus.protocol.league import LeagueStatus, Plan
+from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
@@ -270,6 +272,7 @@ class RunStatus(Specification):
     decoding_share: float = 0.0  # of the time in which the learner decodes rollouts
     last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
     league: LeagueStatus | None = None  # of a game with opponents, bounded (LeagueStatus.bounded)
+    lessons: dict[str, str] = Field(default_factory=dict)  # by parameter: what is played now, for a person
 
     @property
     def fleet_size(self) -> int:
@@ -379,6 +382,8 @@ class Snapshot:
     policy_version: int
     program: str
     weights: dict[str, np.ndarray]
+    # Of a run with lessons: what parameters its actors draw, from the next episodes on.
+    lessons: LessonPlan | None = field(default=None, metadata={"sparse": True})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -452,6 +457,7 @@ class CompactSnapshot:
     program: str
     base_version: int | None  # the version that the differences refer to; None: no differences
     weights: dict[str, np.ndarray]  # uint8 [2, *shape]
+    lessons: LessonPlan | None = field(default=None, metadata={"sparse": True})  # as in Snapshot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,6 +14,7 @@ import msgpack
 from pydantic import AfterValidator, Field, JsonValue, ValidationError, model_validator
 
 from daedalus.protocol.algorithms import ALGORITHMS, ActorDemands, AlgorithmRecord, Epsilons, check_algorithm, is_own
+from daedalus.protocol.lessons import MAX_LESSONS, Lessons, Number, ParameterName, check_lessons
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.models import (
     NaturalInt,
@@ -37,6 +38,7 @@ _MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcom
 
 _ANY_LAG = 2**62  # more updates than any run makes
 _PAST_SHARE = 0.2  # of the matches, if it is not set
+_WITH_PARAMETERS = ("gymnasium", "fast")  # backends
 FROM_PYTHON = "python:"  # beginning of the id of an environment that only the program has which started the run
 
 
@@ -70,6 +72,10 @@ class EnvironmentSpec(Specification):
     """Further arguments of the environment's constructor."""
     training_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """The same in training only, such as those of a shaped reward or of an easier task. Evaluations go without them."""
+    parameters: Annotated[dict[ParameterName, Number], Field(max_length=4 * MAX_LESSONS)] = Field(default_factory=dict)
+    """Numbers that every episode of the true task begins with, by name: arguments of the environment's method
+    `set_parameters`, or without it options of its `reset`. `[lessons]` vary them in training. All numbers that lessons
+    draw for one are whole if it is written without a point. The gymnasium backend only."""
     processes: bool = False
     """Run each environment in its own process, for slow environments. The gymnasium backend only."""
     max_episode_steps: PositiveInt | None = None
@@ -322,8 +328,8 @@ class TrainingSpec(LossSpec):
     target_return: float | None = None
     """The target is reached when the mean return of the last `target_episodes` episodes reaches this value. Where
     actors explore, it is also reached when the mean return of an evaluation does; where they play another task than
-    evaluations (`environment.training_kwargs`, `environment.no_reward_limit`), only then. `daedalus train` confirms it
-    with as many new episodes."""
+    evaluations (`environment.training_kwargs`, `environment.no_reward_limit`, `[lessons]`), only then. `daedalus
+    train` confirms it with as many new episodes."""
     target_episodes: PositiveInt = 100
     """Number of newest training episodes in the mean return."""
     stop_when_solved: bool = True
@@ -525,6 +531,7 @@ class ActorSpec(Specification):
     evaluation: EvaluatorSpec = EvaluatorSpec()
     algorithm: ActorDemands = ActorDemands()
     league: LeagueSpec = LeagueSpec()
+    lessons: Lessons = Field(default_factory=dict)
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1  # of the run
     max_upload_bytes: NaturalInt = 1 << 26  # the learner does not receive larger messages
     # The fields of LearningSpec, unchecked: most actors do not need them, and may not know each encoder and algorithm.
@@ -579,6 +586,8 @@ class RunSpec(Specification):
     """How the learner runs as a service."""
     league: LeagueSpec = LeagueSpec()
     """Opponents in games with several agents."""
+    lessons: Lessons = Field(default_factory=dict)
+    """Parameters of the environment that vary in training, as `[lessons.NAME]`."""
 
     @model_validator(mode="after")
     def _fits_one_message(self) -> "RunSpec":
@@ -694,6 +703,11 @@ class RunSpec(Specification):
         return self
 
     @model_validator(mode="after")
+    def _lessons_end_at_the_true_task(self) -> "RunSpec":
+        check_lessons(self.lessons, self.environment.parameters)
+        return self
+
+    @model_validator(mode="after")
     def _next_action_is_in_the_rollout(self) -> "RunSpec":
         if self.algorithm.next_action and self.collection.rollout_length < 2:
             raise ValueError(
@@ -722,6 +736,8 @@ class RunSpec(Specification):
         for setting, backend in backends.items():
             if self.environment.wrap is not None and backend not in (None, "gymnasium"):
                 raise ValueError(f"environment.wrap needs gymnasium's environments: {setting} is {backend}")
+            if self.environment.parameters and backend not in (None, *_WITH_PARAMETERS):
+                raise ValueError(f"environment.parameters need gymnasium's environments: {setting} is {backend}")
         return self
 
     def for_actors(self) -> ActorSpec:
@@ -733,11 +749,17 @@ class RunSpec(Specification):
             evaluation=_part(EvaluatorSpec, self.evaluation),
             algorithm=_part(ActorDemands, self.algorithm),
             league=self.league,
+            lessons=self.lessons,
             seed=self.training.seed,
             max_upload_bytes=min(self.service.queue_bytes, 2**63 - 1),
         )
         changed = (*changed_fields(spec), *changed_fields(learning, "learning."))
         return spec.model_copy(update={"learning": learning.model_dump(mode="json"), "changed": changed})
+
+    @property
+    def trains_true_task(self) -> bool:
+        """Whether training plays the task of evaluations, so that the returns of both can be compared."""
+        return not self.lessons and self.environment.trains_true_task
 
     @property
     def target(self) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from daedalus.protocol.keys import check_name
 from daedalus.protocol.league import MAX_SIDES, Matches
+from daedalus.protocol.lessons import MAX_LESSONS
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 # A float32 has no number between 16,777,216 and 16,777,218: results of episodes are exact in float64 alone.
@@ -76,6 +77,8 @@ class Rollout:
     episode_lengths: np.ndarray  # [K] int32, their env_steps
     # By name [n] float64, or float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
+    # Of a run with lessons, by parameter [K] float64: the values that these episodes were played with. Empty if K is 0.
+    lessons: dict[str, np.ndarray] = field(default_factory=dict)
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
     # Env_steps of a game with several agents, at most its rows to learn from times its sides, for the opponents' steps
     # count, too; None: each row is one.
@@ -182,6 +185,7 @@ class Gradient:
     episode_returns: np.ndarray  # as in Rollout, like the next two
     episode_lengths: np.ndarray
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
+    lessons: dict[str, np.ndarray] = field(default_factory=dict)  # as in Rollout
 
     @property
     def nbytes(self) -> int:
@@ -241,5 +245,14 @@ def _check_episodes(upload: Upload) -> None:
         if values.ndim != 1 or values.dtype not in EPISODE_DTYPES or not 1 <= len(values) <= most:
             raise ValueError(
                 f"episode_info {name!r} must be float64 or float32 [n], with n from 1 to {most}, "
+                f"not {values.dtype} {values.shape}"
+            )
+    if len(upload.lessons) > MAX_LESSONS:
+        raise ValueError(f"lessons has {len(upload.lessons)} names, at most {MAX_LESSONS} are allowed")
+    for name, values in upload.lessons.items():
+        check_name(name, "the name in lessons")
+        if values.shape != returns.shape or values.dtype != np.float64:
+            raise ValueError(
+                f"lessons {name!r} must be float64 [{len(returns)}], one value for each episode, "
                 f"not {values.dtype} {values.shape}"
             )

@@ -10,6 +10,7 @@ TEST_MODULES = UserModules(
             "corridor_wrappers",
             "counting_environment",
             "faulty_environments",
+            "lesson_environment",
             "mission_environment",
             "nested_environment",
             "picture_environment",

@@ -10,6 +10,7 @@ from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.vector_environments import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.lessons import LessonPlan, LessonSpec
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, EvaluationSpec, LeagueSpec, RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -29,11 +30,14 @@ def started_collector(
     modules: UserModules = TEST_MODULES,
     league: LeagueSpec | None = None,
     longest: int = 27_000,
+    lessons: dict[str, LessonSpec] | None = None,
+    plan: LessonPlan | None = None,
 ) -> EnvironmentCollector:
     """A collector at the start of its first rollout; it steps `environments` instead of its own if they are given."""
     collection = CollectionSpec(envs_per_actor=count, rollout_length=rollout_length)
     evaluation = EvaluationSpec(max_episode_env_steps=longest)
-    run = RunSpec(environment=spec, collection=collection, evaluation=evaluation, league=league or LeagueSpec())
+    league = league or LeagueSpec()
+    run = RunSpec(environment=spec, collection=collection, evaluation=evaluation, league=league, lessons=lessons or {})
     collector = EnvironmentCollector(modules=modules)
     if environments is None:
         collector.prepare(run.for_actors())
@@ -41,13 +45,13 @@ def started_collector(
         with mock.patch.object(environment_collector, "make_environments", return_value=environments):
             collector.prepare(run.for_actors())
     collector.begin(runtime, run.for_actors(), seed)
-    collector.load(snapshot(0, weights or {}))
+    collector.load(snapshot(0, weights or {}, plan))
     return collector
 
 
-def snapshot(policy_version: int, weights: dict[str, np.ndarray]) -> Snapshot:
+def snapshot(policy_version: int, weights: dict[str, np.ndarray], lessons: LessonPlan | None = None) -> Snapshot:
     """A snapshot of learner epoch 1."""
-    return Snapshot(learner_epoch=1, policy_version=policy_version, program="", weights=weights)
+    return Snapshot(learner_epoch=1, policy_version=policy_version, program="", weights=weights, lessons=lessons)
 
 
 def collect(collector: EnvironmentCollector) -> Rollout:

@@ -33,19 +33,29 @@ def save(
     *versions: int,
     spaces: Spaces | None = None,
     weights_seed: int = 5,
+    gain: float | None = None,
     **spec: Any,
 ) -> Path:
-    """Save a run with checkpoints of one untrained policy that takes all actions; return the run directory."""
-    made = make_environments(environment, 1, modules=TEST_MODULES)
-    made.close()
+    """Save a run with checkpoints of one untrained policy that takes all actions; return the run directory.
+
+    `gain`: deviation of the outputs of each layer; None: weights near 1, which saturate large networks.
+    """
+    if spaces is None:
+        made = make_environments(environment, 1, modules=TEST_MODULES)
+        made.close()
+        spaces = made.spaces
     run_spec = RunSpec.model_validate({"policy": {"hidden": (16,)}, **spec, "environment": environment})
-    learner = Learner(run_spec.training, run_spec.policy, spaces or made.spaces)
+    learner = Learner(run_spec.training, run_spec.policy, spaces)
     random = np.random.default_rng(weights_seed)
     weights = {name: random.standard_normal(array.shape, np.float32) for name, array in learner.weights().items()}
+    if gain is not None:
+        weights = {name: gain * array / np.float32(max(4, array[0].size)) ** 0.5 for name, array in weights.items()}
+        weights["policy_head.bias"] *= 0.0  # so that actions depend on the observation
+        weights["policy_head.weight"] -= weights["policy_head.weight"].mean(1, keepdims=True)
     for version in versions:
         encoded = encode_checkpoint(
             spec=run_spec,
-            spaces=spaces or made.spaces,
+            spaces=spaces,
             policy_version=version,
             program=learner.program(),
             parameters=weights,

@@ -259,6 +259,11 @@ def check_run(spec: ActorSpec) -> None:
         raise ActorError(
             "this run takes gradients (collection.upload), and a client sends rollouts: set collection.upload=rollouts"
         )
+    if spec.lessons:
+        raise ActorError(
+            f"this run has lessons for {', '.join(sorted(spec.lessons))}, and a client's own loop makes its "
+            "environment: start the run without lessons, or play the environment with daedalus actor"
+        )
     _refuse_unapplied_settings(spec.environment)
 
 

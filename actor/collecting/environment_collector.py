@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from daedalus.actor.collecting.episode_lessons import EpisodeLessons, LessonDraws, try_extremes
 from daedalus.actor.collecting.lineup import Lineup, rating_copies
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, SeatWriter
 from daedalus.actor.environments.bots import make_bot
@@ -13,7 +14,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.transforms import TransformedEnvironment
-from daedalus.actor.environments.vector_environments import VectorEnvironment
+from daedalus.actor.environments.vector_environments import Observed, VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.messages import Snapshot
@@ -48,6 +49,8 @@ class EnvironmentCollector:
         self._requested: object = None  # what the environments were made for: a backend may make fewer of them
         self._runtime: PolicyRuntime | None = None
         self._writer: RolloutWriter | None = None
+        self._lessons: EpisodeLessons | None = None
+        self._reset: Callable[[], Observed] | None = None  # begins the first episodes, once there is a snapshot
         self._policy_version = -1
 
     def prepare(self, spec: ActorSpec) -> tuple[Spaces, int]:
@@ -56,7 +59,7 @@ class EnvironmentCollector:
         Of games the number is that of the columns of a rollout.
         """
         count = self._count or spec.collection.envs_per_actor
-        requested = (spec.environment, spec.league, count)
+        requested = (spec.environment, spec.league, spec.lessons, count)
         if self._requested != requested:
             self.close()
         if self._environments is None:
@@ -64,6 +67,9 @@ class EnvironmentCollector:
                 self._make_games(spec, count)
             else:
                 self._environments = make_environments(spec.environment, count, modules=self._modules)
+                if spec.lessons:
+                    made = self._environments
+                    try_extremes(spec, made.count, made.set_parameters, partial(made.reset, 0))
             self._requested = requested
         environments = self._environments
         assert environments is not None
@@ -91,10 +97,10 @@ class EnvironmentCollector:
             _logger.info("%s", line)
 
     def _games(self, spec: ActorSpec, count: int) -> GameEnvironments:
-        return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league))
+        return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league, count))
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
-        """See Collector. Reset the environments."""
+        """See Collector. The environments are reset when the first snapshot is loaded, which may carry lessons."""
         environments = self._environments
         assert environments is not None
         environment_seed, *action_seed = np.random.SeedSequence(seed).generate_state(4).tolist()  # of 32 bits each
@@ -111,13 +117,28 @@ class EnvironmentCollector:
             random=np.random.default_rng(action_seed),
             epsilon=epsilon,
         )
-        self._writer.start(environments.reset(environment_seed % (_SEEDS - environments.count)))
+        self._lessons = None
+        if spec.lessons:
+            draws = LessonDraws(spec, np.random.default_rng([*action_seed, 2]))
+            self._lessons = EpisodeLessons(environments.count, spec, draws, environments.set_parameters)
+        self._reset = partial(environments.reset, environment_seed % (_SEEDS - environments.count))
 
     def load(self, snapshot: Snapshot) -> None:
         """See Collector."""
         assert self._runtime is not None
+        assert self._writer is not None
         self._runtime.load(snapshot.weights)
         self._policy_version = snapshot.policy_version
+        if self._lessons is not None and snapshot.lessons is not None:
+            self._lessons.draws.plan = snapshot.lessons
+        if self._reset is not None:
+            self._begin_episodes()
+            self._writer.start(self._reset())
+            self._reset = None
+
+    def _begin_episodes(self) -> None:
+        if self._lessons is not None:
+            self._lessons.begin_due()
 
     def confirm(self, at: float) -> None:
         """See Collector. Has no effect: the policy acts whatever its age."""
@@ -127,13 +148,20 @@ class EnvironmentCollector:
         writer, environments = self._writer, self._environments
         assert writer is not None
         assert environments is not None
-        on_row()
-        while not writer.record(*environments.step(writer.act())):
+        is_full = False
+        while not is_full:
             on_row()
-        return writer.finish(identity, self._policy_version, environments.take_episode_info())
+            self._begin_episodes()
+            observed, rewards, terminated, truncated = environments.step(writer.act())
+            is_full = writer.record(observed, rewards, terminated, truncated)
+            if self._lessons is not None:
+                self._lessons.end(terminated | truncated)
+        lessons = {} if self._lessons is None else self._lessons.take_finished()
+        return writer.finish(identity, self._policy_version, environments.take_episode_info(), lessons)
 
     def close(self) -> None:
         """See Collector. Close the environments."""
         if self._environments is not None:
             self._environments.close()
         self._environments = self._requested = self._runtime = self._writer = self.lineup = None
+        self._lessons = self._reset = None

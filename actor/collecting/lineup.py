@@ -69,9 +69,10 @@ def outcome(means: Sequence[float], side: int) -> int:
     return 1 if math.isclose(own, best, rel_tol=1e-9, abs_tol=1e-9) else 0 if own > best else 2
 
 
-def rating_copies(league: LeagueSpec, agents: Sequence[str]) -> int:
-    """Return how many copies of a game only rate players, besides those that are learned from."""
-    return 1 if league.rating_share > 0.0 and len(sides_of(league, agents)) > 1 else 0
+def rating_copies(league: LeagueSpec, copies: int, agents: Sequence[str]) -> int:
+    """Return how many copies of a game only rate players, besides `copies` that are learned from."""
+    share = league.rating_share
+    return math.ceil(share / (1.0 - share) * copies) if len(sides_of(league, agents)) > 1 else 0
 
 
 def _shares_without_opponents(league: LeagueSpec) -> str:
@@ -119,7 +120,7 @@ class Lineup:
         Raises EnvironmentSetupError if the settings do not fit the game.
         """
         self._league, self._games, self._make_bot = league, games, make_bot
-        self._sides = [np.array(side) for side in sides_of(league, games.agents)]
+        self._sides = sides_of(league, games.agents)
         self._seats, self._copies, self._learned = games.seats, games.count // games.seats, copies
         share = 0.0
         if len(self._sides) > 1:
@@ -139,7 +140,7 @@ class Lineup:
                 math.floor(0.5 / share) + 1,
             )
         self._alone = copies - with_opponents  # copies with the newest policy in all seats
-        self.columns = self._alone * self._seats + with_opponents * len(self._sides[0])
+        self.columns = self._alone * self._seats + with_opponents * max(map(len, self._sides))
         self.is_newest, self.is_greedy = np.ones(games.count, np.bool_), np.zeros(games.count, np.bool_)
         self.column = np.full(games.count, -1)
         self._player = np.zeros(games.count, np.int64)
@@ -148,14 +149,21 @@ class Lineup:
         self._next: list[Match | None] = [None] * self._copies
         self._bots: dict[tuple[str, int], Bot] = {}  # by name and seat
         self._policies: dict[str, _OpponentPolicy] = {}  # the one that was chosen longest ago first
+        self._numbered: dict[int, _OpponentPolicy] = {}
         self._counts: dict[Match, list[int]] = {}
-        self._longest, self._steps = longest, np.zeros(self._copies, np.int64)  # in the match of each copy
+        self._longest, self._steps = longest, [0] * self._copies  # in the match of each copy
         self._warned = False  # of an abandoned match
         self._played, self._rated = 0, 0  # matches
-        self._opponent, self._left = NEWEST, 0  # of the next matches, and how many of them
+        self._opponent, self._left = NEWEST, 0  # of the next matches, and of how many of them at least
+        self._redraws = True  # whether a rollout has begun since it was drawn
         fixed = {name: weight for name, weight in league.opponents.items() if weight and is_bot(name)}
         self.plan = Plan(training=tuple(PlannedOpponent(player=name, weight=each) for name, each in fixed.items()))
         self.wanted = ""  # a player whose policy was to play and is not here; empty if there is none
+
+    @property
+    def against_opponents(self) -> range:
+        """The copies in which the newest policy plays one side, against an opponent."""
+        return range(self._alone, self._learned)
 
     @property
     def sides(self) -> int:
@@ -174,9 +182,10 @@ class Lineup:
         """Choose the players of the first matches; call it before the games are reset."""
         self._random = random
         self._policies.clear()
+        self._numbered.clear()
         self._counts.clear()
         self._scores[:] = 0.0
-        self._left = 0
+        self._left, self._redraws = 0, True
         for copy in range(self._copies):
             self._choose(copy)
 
@@ -196,9 +205,9 @@ class Lineup:
             if len(self._policies) < _MOST_POLICIES:
                 break
             if policy.number not in playing and not self._is_chosen(old):
-                del self._policies[old]
-        number = max((policy.number for policy in self._policies.values()), default=0) + 1
-        self._policies[name] = _OpponentPolicy(number, runtime, len(self._player))
+                del self._policies[old], self._numbered[policy.number]
+        number = max(self._numbered, default=0) + 1
+        self._policies[name] = self._numbered[number] = _OpponentPolicy(number, runtime, len(self._player))
 
     def give_up(self, name: str) -> None:
         """Note that the policy of a player is not to be had now."""
@@ -215,21 +224,27 @@ class Lineup:
 
     def _choose(self, copy: int) -> None:
         """Choose the players of the next match of a copy, which its next reset begins."""
+        if copy < self._alone:
+            return
         match = self._next[copy] = self._drawn(copy)
         for side, seats in enumerate(self._sides):
-            player = NEWEST if match is None else match.first if side == match.side else match.second
-            for seat in copy * self._seats + seats:
-                self._games.seat_bot(int(seat), self._bot(player, int(seat)) if is_bot(player) else None)
+            player = self._player_of(match, side)
+            for seat in seats:
+                seat += copy * self._seats
+                self._games.seat_bot(seat, self._bot(player, seat) if is_bot(player) else None)
+
+    @staticmethod
+    def _player_of(match: Match | None, side: int) -> str:
+        return NEWEST if match is None else match.first if side == match.side else match.second
 
     def _drawn(self, copy: int) -> Match | None:
-        if copy < self._alone:
-            return None
-        side = int(self._random.integers(len(self._sides)))
+        side = int(self._random.random() * len(self._sides))
         if copy < self._learned:
-            # As many matches in a row as copies play at once: one call then acts for all of them.
-            if self._left == 0 or not self._is_here(self._opponent):
+            # The same in a rollout, and in as many matches as copies play at once: one call then acts for all of them.
+            if (self._redraws and self._left <= 0) or not self._is_here(self._opponent):
                 drawn = self._pick({(NEWEST, each.player): each.weight for each in self.plan.training})
                 self._opponent, self._left = NEWEST if drawn is None else drawn[1], self._learned - self._alone
+                self._redraws = False
             self._left -= 1
             return Match("training", NEWEST, self._opponent, side)
         drawn = self._pick({(each.first, each.second): each.weight for each in self.plan.rating})
@@ -262,24 +277,27 @@ class Lineup:
     def seat(self, copies: Sequence[int]) -> None:
         """Let the chosen players take the seats of copies whose match has begun."""
         for copy in copies:
-            match = self._current[copy] = self._next[copy]
             first = copy * self._seats
-            seats = np.arange(first, first + self._seats)
+            seats = slice(first, first + self._seats)
+            if copy < self._alone:  # not always in the same columns: some seats act more often than others
+                self.column[seats] = self._random.permutation(self._seats) + first
+                continue
+            match = self._current[copy] = self._next[copy]
             self._scores[seats], self._steps[copy] = 0.0, 0
             self.column[seats] = -1
             for side, members in enumerate(self._sides):
-                player = NEWEST if match is None else match.first if side == match.side else match.second
-                self._player[first + members] = self._number(player)
-                if player in self._policies:
-                    self._policies[player].state[first + members] = 0.0
-            self.is_newest[seats] = self._player[seats] == _NEWEST
+                player = self._player_of(match, side)
+                number = self._number(player)
+                for seat in members:
+                    self._player[first + seat] = number
+                    self.is_newest[first + seat] = number == _NEWEST
+                    if number > _NEWEST:
+                        self._numbered[number].state[first + seat] = 0.0
             rates = copy >= self._learned
             self.is_greedy[seats] = rates and self._league.rating_actions == "greedy"
-            if copy < self._alone:  # not always in the same columns: some seats act more often than others
-                self.column[self._random.permutation(seats)] = seats
-            elif not rates:
+            if not rates:
                 assert match is not None
-                own = self._random.permutation(first + self._sides[match.side])
+                own = self._random.permutation(self._sides[match.side]) + first
                 self.column[own] = self._alone * self._seats + (copy - self._alone) * len(own) + np.arange(len(own))
 
     def _number(self, player: str) -> int:
@@ -291,32 +309,33 @@ class Lineup:
         """Write the actions of the opponents' policies in the seats that act.
 
         Args:
-          acting: [seats] bool.
+          acting: [seats] bool, the seats whose action has an effect.
           stacks, masks: of all seats.
           actions: of each component [seats, D].
         """
         if not self._policies:
             return
-        others = acting & (self._player > _NEWEST)
-        if not np.count_nonzero(others):
-            return
-        for policy in self._policies.values():
-            seats = np.flatnonzero(others & (self._player == policy.number))
-            if not len(seats):
-                continue
+        others = (acting & (self._player > _NEWEST)).nonzero()[0]
+        players = self._player[others]
+        for number in sorted(set(players.tolist())):
+            policy = self._numbered[number]
+            seats = others[players == number]
             choice = policy.runtime.act(
                 {name: values[seats] for name, values in stacks.observations.items()},
                 policy.state[seats],
                 self.noise(policy.runtime.noise_size, seats, self._random),
                 {name: values[seats] for name, values in masks.items()},
             )
-            policy.state[seats] = np.where(np.isfinite(choice.state), choice.state, np.float32(0.0))
+            if policy.runtime.state_size:
+                policy.state[seats] = np.where(np.isfinite(choice.state), choice.state, np.float32(0.0))
             for name, values in actions.items():
                 values[seats] = choice.actions[name]
 
     def noise(self, size: NoiseSize, seats: np.ndarray, random: np.random.Generator) -> Noise:
         """Return the noise for the actions of seats: neutral where the player is greedy."""
         noise = draw_noise(size, len(seats), random)
+        if self._league.rating_actions != "greedy":
+            return noise
         greedy = self.is_greedy[seats]
         if np.count_nonzero(greedy):
             neutral = neutral_noise(size, len(seats))
@@ -338,14 +357,18 @@ class Lineup:
             self._played, self._rated = self._played + (not rates), self._rated + rates
             if not rates:
                 self._choose(copy)
+        if self._learned == self._copies:
+            return []
+        abandoned = self._abandoned()
+        if ended or abandoned:
             self._let_rate()
-        return self._abandoned()
+        return abandoned
 
     def _abandoned(self) -> list[int]:
         """Abandon the matches that only rate and do not end."""
         abandoned = []
-        self._steps[self._learned :] += 1
         for copy in range(self._learned, self._copies):
+            self._steps[copy] += 1
             if self._steps[copy] <= self._longest or self._games.is_over(copy):
                 continue
             if not self._warned:
@@ -353,12 +376,11 @@ class Lineup:
                 _logger.warning(
                     "a match of %s and %s, which only rates them, is abandoned without a result: it did not end in %s "
                     "steps (evaluation.max_episode_env_steps)",
-                    *((NEWEST, NEWEST) if (match := self._current[copy]) is None else (match.first, match.second)),
+                    *(self._player_of(self._current[copy], side) for side in range(2)),
                     f"{self._longest:,}",
                 )
             self._games.abandon(copy)
             self._rated += 1  # the next one begins when its turn comes
-            self._let_rate()
             abandoned.append(copy)
         return abandoned
 
@@ -378,12 +400,13 @@ class Lineup:
         if match is None or match.first == match.second:
             return
         first = copy * self._seats
-        means = [float(self._scores[first + members].mean()) for members in self._sides]
+        scores = self._scores[first : first + self._seats].tolist()
+        means = [sum(scores[seat] for seat in side) / len(side) for side in self._sides]
         self._counts.setdefault(match, [0, 0, 0])[outcome(means, match.side)] += 1
 
     def take_matches(self) -> Matches | None:
-        """Return the results since the last call; None if no match ended."""
-        counts, self._counts = self._counts, {}
+        """Return the results of a rollout, since the last call; None if no match ended."""
+        counts, self._counts, self._redraws = self._counts, {}, True
         if not counts:
             return None
         return Matches(

@@ -256,11 +256,16 @@ class RolloutWriter:
         self.start(observed)
 
     def finish(
-        self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None
+        self,
+        identity: RolloutIdentity,
+        policy_version: int,
+        episode_info: dict[str, np.ndarray] | None = None,
+        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
         """Return the full rollout. Its arrays are views: encode or copy it before the next `act`.
 
-        `episode_info` is that of the environments (VectorEnvironment.take_episode_info).
+        `episode_info` is that of the environments (VectorEnvironment.take_episode_info), and `lessons` are the
+        parameters of the episodes that ended (EpisodeLessons.take_finished).
         """
         self._row = 0
         if self._reward_clip is not None:
@@ -287,6 +292,7 @@ class RolloutWriter:
             episode_returns=finished.returns[-self._rewards.size :],
             episode_lengths=finished.lengths[-self._rewards.size :],
             episode_info=episode_info or {},
+            lessons=lessons or {},
             overridden=self._overridden if self._overridden.any() else None,
         )
 
@@ -336,12 +342,12 @@ class SeatWriter(RolloutWriter):
         if len(self._deciding):
             choice = self._runtime.act(inputs.observations, inputs.state, inputs.noise, inputs.masks, inputs.epsilon)
             self.take_choice(choice)
-        self._lineup.act(self._acting, self._stacks, self._current_masks, self._chosen)
+        self._lineup.act(self._acting & ~self._episodes.ended, self._stacks, self._current_masks, self._chosen)
         return self._chosen
 
     def begin_row(self) -> RowInputs:
         """See RolloutWriter. The inputs are those of the acting seats of the newest policy."""
-        seats = self._deciding = np.flatnonzero(self._acting & self._lineup.is_newest)
+        seats = self._deciding = (self._acting & self._lineup.is_newest).nonzero()[0]
         columns = self._lineup.column[seats]
         learned = columns >= 0
         if not learned.all():
@@ -375,11 +381,15 @@ class SeatWriter(RolloutWriter):
         """
         copies = np.zeros(len(self._over), np.bool_)
         copies[written // self._seats] = True
-        if self._lineup.has_opponents:
-            columns = self._lineup.column.reshape(-1, self._seats)
-            learned = (columns >= 0) & (self._rows[columns] < len(self._rewards))
-            others = (self._acting & ~self._lineup.is_newest).reshape(-1, self._seats).any(axis=1)
-            copies |= learned.any(axis=1) & others & ~self._over
+        if opposed := self._lineup.against_opponents:
+            first = opposed.start * self._seats
+            learned = self._rows[first:] < len(self._rewards)
+            if len(learned) > len(opposed):
+                learned = learned.reshape(len(opposed), -1).any(axis=1)
+            learned &= ~self._over[opposed.start : opposed.stop]
+            others = (self._acting & (self._lineup.column < 0))[first : opposed.stop * self._seats].nonzero()[0]
+            others //= self._seats
+            copies[opposed.start + others[learned[others]]] = True
         return int(np.count_nonzero(copies))
 
     def take_choice(self, choice: Choice) -> None:
@@ -406,7 +416,7 @@ class SeatWriter(RolloutWriter):
         self._take_seats(observed)
         resets = self._episodes.ended
         # A column may go on with another seat after a row that resets.
-        seats = np.flatnonzero(observed.acting & (self._lineup.column >= 0))
+        seats = (observed.acting & (self._lineup.column >= 0)).nonzero()[0]
         columns = self._lineup.column[seats]
         written = self._writing[columns]
         seats, columns = seats[written], columns[written]
@@ -426,7 +436,7 @@ class SeatWriter(RolloutWriter):
         self._show(observed)
         rewards = rewards.astype(np.float32)
         counted = self._lineup.column >= 0
-        abandoned = self._lineup.step(rewards, np.flatnonzero(observed.over & ~was_over).tolist())
+        abandoned = self._lineup.step(rewards, (observed.over & ~was_over).nonzero()[0].tolist())
         # Also those that are not written: the agents who act most often would have too few results in the mean.
         self._episodes.step_seats(observed.acting, rewards, terminated | truncated, counted)
         for copy in abandoned:
@@ -435,10 +445,14 @@ class SeatWriter(RolloutWriter):
         return bool((self._rows == len(self._rewards)).all())
 
     def finish(
-        self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None
+        self,
+        identity: RolloutIdentity,
+        policy_version: int,
+        episode_info: dict[str, np.ndarray] | None = None,
+        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
-        """See RolloutWriter."""
-        rollout = super().finish(identity, policy_version, episode_info)
+        """See RolloutWriter. No game has lessons."""
+        rollout = super().finish(identity, policy_version, episode_info, lessons)
         if not self._warned and self._skipped > self._rewards.size:
             self._warned = True
             _logger.warning(

@@ -6,7 +6,7 @@ that is not composite has the name `observation` or `action`.
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -15,6 +15,9 @@ from pydantic import ValidationError
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
+
+if TYPE_CHECKING:
+    from daedalus.policy.saving.onnx_graph import OnnxGraph
 
 _LONGEST_NAME = 64  # ComponentName of the protocol
 
@@ -145,6 +148,32 @@ class BoundedActions:
             actions = np.rint(actions)
         return actions.reshape(len(values), *self._space.shape).astype(self._space.dtype)
 
+    def exported(self, graph: "OnnxGraph", values: str) -> str:
+        """Add what `of` does to an ONNX graph, in float32: [rows, D] -> [rows, D]. NaN has no centre there."""
+        low, high = _inside(self._low, self._high)
+        if self._bounded.any():
+            start, half = (np.where(self._bounded, each, 0.0) for each in (self._low, 0.5 * self._range))
+            scaled = graph.add("Add", values, graph.constant(1.0))
+            scaled = graph.add("Add", graph.add("Mul", scaled, graph.constant(half)), graph.constant(start))
+            everywhere = self._bounded.all()
+            kept = graph.constant(self._bounded, np.bool_)
+            values = scaled if everywhere else graph.add("Where", kept, scaled, values)
+        values = graph.add("Min", graph.add("Max", values, graph.constant(low)), graph.constant(high))
+        return graph.add("Round", values) if self._rounded else values
+
+
+def _inside(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return bounds in float32, rounded to the inner side."""
+    with np.errstate(over="ignore"):
+        rounded_low, rounded_high = low.astype(np.float32), high.astype(np.float32)
+    rounded_low = np.where(rounded_low < low, np.nextafter(rounded_low, np.float32(np.inf)), rounded_low)
+    return rounded_low, np.where(rounded_high > high, np.nextafter(rounded_high, np.float32(-np.inf)), rounded_high)
+
+
+def exported_dtype(space: gymnasium.Space) -> type:
+    """Return the dtype of an action in an ONNX file: float32 for numbers with fractions, else int64."""
+    return np.float32 if isinstance(space, gym.Box) and space.dtype.kind == "f" else np.int64
+
 
 def _bounds(values: np.ndarray) -> tuple[float | None, ...]:
     numbers = values.ravel().astype(np.float64)
@@ -221,6 +250,21 @@ class ObservationComponent(NamedTuple):
         with np.errstate(all="ignore"):  # the learner, or the evaluation, names a value that is not finite
             return values.astype(np.float32)
 
+    def add_input(self, graph: "OnnxGraph") -> str:
+        """Add this component as an input of an ONNX graph, and return what `values` does of it.
+
+        The input has the shape of the component in the environment, and is int64 for a discrete one, uint8 where the
+        environment's is, else float32.
+        """
+        space = self.leaf.space
+        dtype = np.int64 if self.first is not None else np.uint8 if space.dtype == np.uint8 else np.float32
+        values = graph.input(self.leaf.name, dtype, tuple(space.shape or ()))
+        if space.shape != self.shape:
+            values = graph.reshaped(values, self.shape)
+        if self.first is not None and self.first.any():
+            values = graph.add("Sub", values, graph.constant(self.first, np.int64))
+        return values
+
     @property
     def _where(self) -> str:
         return f" in component {self.leaf.name!r}" if self.leaf.path else ""
@@ -294,7 +338,17 @@ class ActionComponents:
     def env_actions(self, values: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for values {name: [E, D]} of all components."""
         parts = {leaf.path: self._env_action(leaf, values[leaf.name]) for leaf in self._leaves}
-        return _nested(self._space, (), parts)
+        return nested(self._space, (), parts)
+
+    def add_outputs(self, graph: "OnnxGraph", values: Mapping[str, str]) -> None:
+        """Add what `env_actions` does to an ONNX graph, with one output for each component."""
+        for leaf in self._leaves:
+            value, space = values[leaf.name], leaf.space
+            if isinstance(space, gym.Box):
+                value = graph.cast(self._bounded[leaf.name].exported(graph, value), exported_dtype(space))
+            elif isinstance(space, gym.Discrete | gym.MultiDiscrete) and np.any(space.start):
+                value = graph.add("Add", value, graph.constant(np.ravel(space.start), np.int64))
+            graph.output(leaf.name, value, exported_dtype(space), tuple(space.shape or ()))
 
     def _component(self, leaf: Leaf) -> ActionSpace:
         match leaf.space:
@@ -330,11 +384,12 @@ def _check_choices(space: gymnasium.Space, last: np.ndarray) -> None:
         raise EnvironmentSetupError(f"action space {described(space)} {misfit}: give it a wider dtype")
 
 
-def _nested(space: gymnasium.Space, path: tuple[str | int, ...], parts: dict[tuple[str | int, ...], Any]) -> Any:
+def nested(space: gymnasium.Space, path: tuple[str | int, ...], parts: dict[tuple[str | int, ...], Any]) -> Any:
+    """Return a value of a nested space from those of its leaves, by the keys and indices that lead to them."""
     if isinstance(space, gym.Dict):
-        return {key: _nested(part, (*path, key), parts) for key, part in space.spaces.items()}
+        return {key: nested(part, (*path, key), parts) for key, part in space.spaces.items()}
     if isinstance(space, gym.Tuple):
-        return tuple(_nested(part, (*path, index), parts) for index, part in enumerate(space.spaces))
+        return tuple(nested(part, (*path, index), parts) for index, part in enumerate(space.spaces))
     return parts[path]
 
 
@@ -390,13 +445,19 @@ def dtype_misfit(space: gymnasium.Space, array: np.ndarray) -> str:
     return f"has the value {array[changed].flat[0]:g}, but its space has dtype {space.dtype}" if changed.any() else ""
 
 
-def only_of_batch(space: gymnasium.Space, batch: Any) -> Any:
-    """Return the only value of a batch of one, as the nested space has it."""
+def only_of_batch(space: gymnasium.Space, batch: Any, row: int = 0) -> Any:
+    """Return one value of a batch, of one by default, as the nested space has it."""
     if isinstance(space, gym.Dict):
-        return {key: only_of_batch(part, batch[key]) for key, part in space.spaces.items()}
+        return {key: only_of_batch(part, batch[key], row) for key, part in space.spaces.items()}
     if isinstance(space, gym.Tuple):
-        return tuple(only_of_batch(part, batch[index]) for index, part in enumerate(space.spaces))
-    return batch[0]
+        return tuple(only_of_batch(part, batch[index], row) for index, part in enumerate(space.spaces))
+    return batch[row]
+
+
+def stacked(space: gymnasium.Space, values: Sequence[Any]) -> Any:
+    """Return values of a nested space as a batch."""
+    parts = {leaf.path: np.stack([leaf.of(value) for value in values]) for leaf in leaves(space, "action")}
+    return nested(space, (), parts)
 
 
 AGENT = "agent"  # component of the observation with environment.agent_ids

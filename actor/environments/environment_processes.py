@@ -232,6 +232,10 @@ class EnvironmentProcesses(AsyncVectorEnv):
         """See AsyncVectorEnv. Raises EnvironmentSetupError if an environment fails or its process has died."""
         return self._call(lambda: super(EnvironmentProcesses, self).step(actions))
 
+    def set_attr(self, name: str, values: Any) -> None:
+        """See AsyncVectorEnv. Raises EnvironmentSetupError if a process has died."""
+        self._call(lambda: super(EnvironmentProcesses, self).set_attr(name, values))
+
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
         """End the processes: by request if they are idle, then by a signal, then by force.
 

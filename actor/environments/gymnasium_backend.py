@@ -23,6 +23,7 @@ from daedalus.actor.environments.environment_processes import EnvironmentProcess
 from daedalus.actor.environments.given_environment import Maker, given_environment
 from daedalus.actor.environments.gymnasium_environments import EnvironmentsInTurn, GymnasiumEnvironments
 from daedalus.actor.environments.info import has_choices
+from daedalus.actor.environments.parameters import WithParameters
 from daedalus.actor.environments.rendering import CountedSteps, render_without_display
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_code import first_line
@@ -88,6 +89,8 @@ class EnvironmentFactory:
             if self.camera is not None:
                 environment = below = CountedSteps(environment)
             environment = _wrapped(environment, spec.wrap, self.modules)
+        if spec.parameters:
+            environment = WithParameters(environment, spec.id, spec.parameters)
         if environment.has_wrapper_attr("action_masks"):
             environment = MaskInInfo(environment)
         if spec.action_repeat > 1 or spec.no_reward_limit is not None or self.camera is not None:
@@ -111,7 +114,7 @@ class EnvironmentFactory:
         if registered.vector_entry_point is None or registered.namespace == "ALE":
             return False
         spec = self.spec
-        wrappers = (spec.no_reward_limit, spec.wrap, self.render_mode, self.camera)
+        wrappers = (spec.no_reward_limit, spec.wrap, self.render_mode, self.camera, spec.parameters or None)
         return spec.action_repeat == 1 and not spec.processes and all(wrapper is None for wrapper in wrappers)
 
 
@@ -238,6 +241,11 @@ def _late_rendered(registered: EnvSpec, backend: str) -> EnvSpec:
 
 def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
     spec, registered = factory.spec, registration(factory.spec.id, factory.modules)
+    if spec.parameters and registered.entry_point is None:
+        raise EnvironmentSetupError(
+            f"environment {spec.id} has a vector entry point only, whose environments take no environment.parameters: "
+            "register an entry point for one environment, too"
+        )
     if factory.uses_vector_entry_point(registered):
         if not factory.one_episode:
             return gymnasium.make_vec(registered, count, "vector_entry_point", **_kwargs(spec))

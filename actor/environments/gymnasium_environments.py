@@ -4,7 +4,7 @@ import logging
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from enum import Enum
 from functools import partial
@@ -24,10 +24,12 @@ from daedalus.actor.environments.environment_errors import (
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
+from daedalus.actor.environments.parameters import wrapper_of
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.actor.environments.wrappers import OfItsSpace
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import USER_STATE
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.texts import bounded_text, printable
 
 _LONGEST_NAME = 24  # characters of the name of an action
@@ -146,6 +148,7 @@ class GymnasiumEnvironments:
         self.action_space: gymnasium.Space = environment.single_action_space
         self._read_space = without(self.observation_space, leave_out)
         self._episode_info = EpisodeInfo()
+        self._parameters: dict[int, Parameters] = {}  # of environments in processes
         # Environments that gymnasium steps one by one enter it themselves, so that the batch is made under ours.
         one_by_one = isinstance(environment, SyncVectorEnv | EnvironmentProcesses)
         self._user_state: Callable[[], AbstractContextManager[None]] = (
@@ -170,6 +173,18 @@ class GymnasiumEnvironments:
             raise self._failure("reset", error) from error
         self.action_mask = self._checked_info("reset", info).get(MASK_KEY)
         return observations
+
+    def set_parameters(self, parameters: Mapping[int, Parameters]) -> None:
+        """Set what some of the environments, by their index, begin their next episodes with, in place of the true task.
+
+        The specification has `parameters`, with the same names. Raises EnvironmentSetupError if a process has died.
+        """
+        if isinstance(self._environment, SyncVectorEnv):
+            for index, each in parameters.items():
+                wrapper_of(self._environment.envs[index]).next_parameters = each
+            return
+        self._parameters |= parameters
+        self._environment.set_attr("next_parameters", [self._parameters.get(each, {}) for each in range(self.count)])
 
     def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments."""

@@ -41,7 +41,9 @@ def make_environments(
     if camera is not None and (count != 1 or render_mode != "rgb_array"):
         raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
     if spec.backend != "gymnasium" and not spec.is_game:
-        _refuse_gymnasium_options(spec, {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera})
+        asked = {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera}
+        asked["environment.parameters"] = spec.parameters or None if spec.backend != "fast" else None
+        _refuse_gymnasium_options(spec, asked)
     bare, rest = make_bare(spec, count, modules, render_mode, camera, one_episode)
     try:
         return TransformedEnvironment(bare, rest, one_episode=one_episode)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -11,6 +11,9 @@ import numpy as np
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.protocol.spaces import colours_last
 from daedalus.protocol.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from daedalus.policy.saving.onnx_graph import OnnxGraph
 
 Shape = tuple[int, ...]  # of one frame
 
@@ -24,6 +27,7 @@ class _Transform(NamedTuple):
     apply: Callable[[np.ndarray], np.ndarray]
     shape: Callable[[Shape], Shape]  # of the transformed frame; raises ValueError if the transform does not fit
     work_bytes: Callable[[Shape], int]  # size of the largest array that `apply` allocates for one frame
+    exported: Callable[["OnnxGraph", str, Shape], str]  # adds what `apply` does, to the bit, to an ONNX graph
 
 
 class Pixels:
@@ -37,7 +41,7 @@ class Pixels:
         """Raises EnvironmentSetupError if a transform does not fit the space."""
         self._transforms = _transforms(spec)
         self._colours_first = len(space.shape) == 3 and not colours_last(space.shape)
-        shape = (*space.shape[1:], space.shape[0]) if self._colours_first else space.shape
+        shape = self._first_shape = (*space.shape[1:], space.shape[0]) if self._colours_first else space.shape
         self.largest_bytes = math.prod(shape) * np.dtype(space.dtype).itemsize
         for transform in self._transforms:
             try:
@@ -58,6 +62,15 @@ class Pixels:
             frames = self._apply(transform.apply, frames)
         return frames
 
+    def exported(self, graph: "OnnxGraph", frames: str) -> str:
+        """Add the transforms to an ONNX graph: [rows, *space.shape] -> [rows, *self.shape]."""
+        shape = self._first_shape
+        if self._colours_first:
+            frames = graph.add("Transpose", frames, perm=[0, 2, 3, 1])
+        for transform in self._transforms:
+            frames, shape = transform.exported(graph, frames, shape), transform.shape(shape)
+        return graph.add("Transpose", frames, perm=[0, 3, 1, 2]) if self._colours_first and len(shape) == 3 else frames
+
     def _apply(self, transform: Callable[[np.ndarray], np.ndarray], frames: np.ndarray) -> np.ndarray:
         """Apply a transform of frames whose colours are on the last axis."""
         if not self._colours_first or frames.ndim == 3:
@@ -71,12 +84,14 @@ def _transforms(spec: EnvironmentSpec) -> list[_Transform]:
     transforms = []
     if (margins := spec.crop) is not None:
         shape = partial(_cropped_shape, margins=margins)
-        transforms.append(_Transform(f"crop={margins}", partial(crop, margins=margins), shape, _no_bytes))
+        exported = partial(_exported_crop, margins=margins)
+        transforms.append(_Transform(f"crop={margins}", partial(crop, margins=margins), shape, _no_bytes, exported))
     if spec.grey:  # its largest array has two bytes for each pixel, where the frame has three
-        transforms.append(_Transform("grey", grey, _grey_shape, _no_bytes))
+        transforms.append(_Transform("grey", grey, _grey_shape, _no_bytes, _exported_grey))
     if (size := spec.resize) is not None:
         shape, work_bytes = partial(_resized_shape, size=size), partial(_resize_bytes, size=size)
-        transforms.append(_Transform(f"resize={size}", partial(resize, size=size), shape, work_bytes))
+        exported = partial(_exported_resize, size=size)
+        transforms.append(_Transform(f"resize={size}", partial(resize, size=size), shape, work_bytes, exported))
     return transforms
 
 
@@ -89,6 +104,12 @@ def crop(frames: np.ndarray, margins: tuple[int, int, int, int]) -> np.ndarray:
     top, _, left, _ = margins
     height, width = _cropped_shape(frames.shape[1:], margins)[:2]
     return frames[:, top : top + height, left : left + width]
+
+
+def _exported_crop(graph: "OnnxGraph", frames: str, shape: Shape, margins: tuple[int, int, int, int]) -> str:
+    top, _, left, _ = margins
+    height, width = _cropped_shape(shape, margins)[:2]
+    return graph.sliced(graph.sliced(frames, 1, top, top + height), 2, left, left + width)
 
 
 def _cropped_shape(shape: Shape, margins: tuple[int, int, int, int]) -> Shape:
@@ -110,6 +131,14 @@ def grey(frames: np.ndarray) -> np.ndarray:
     return luma.astype(np.uint8)
 
 
+def _exported_grey(graph: "OnnxGraph", frames: str, shape: Shape) -> str:
+    """Add `grey`: the sums are whole numbers below 2 ** 24, which float32 has."""
+    weights = graph.constant(np.reshape(_GREY_WEIGHTS, (3, 1)))
+    luma = graph.reshaped(graph.add("MatMul", graph.cast(frames, np.float32), weights), _grey_shape(shape))
+    luma = graph.add("Mul", graph.add("Add", luma, graph.constant(128.0)), graph.constant(1 / 256))
+    return graph.cast(graph.add("Floor", luma), np.uint8)
+
+
 def _grey_shape(shape: Shape) -> Shape:
     if len(shape) != 3 or shape[2] != 3:
         raise ValueError(f"a frame of shape {shape} is not RGB: it must have 3 colours")
@@ -126,6 +155,29 @@ def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     sums = _area_sums(_area_sums(frames, 1, size[0]), 2, size[1])
     sums /= height * width
     return np.rint(sums, out=sums).astype(np.uint8)
+
+
+def _exported_resize(graph: "OnnxGraph", frames: str, shape: Shape, size: tuple[int, int]) -> str:
+    """Add `resize`: two products with the matrices of the overlaps."""
+    height, width = shape[:2]
+    frames = graph.cast(frames, np.float32)
+    if len(shape) == 3:
+        frames = graph.add("Transpose", frames, perm=[0, 3, 1, 2])
+    sums = graph.add("MatMul", graph.constant(_overlap_matrix(height, size[0])), frames)
+    sums = graph.add("MatMul", sums, graph.constant(_overlap_matrix(width, size[1]).T))
+    if len(shape) == 3:
+        sums = graph.add("Transpose", sums, perm=[0, 2, 3, 1])
+    # Of a division after a product, onnxruntime makes factors of the product, which rounds in another way.
+    means = graph.add("Div", graph.add("Abs", sums), graph.constant(height * width))
+    return graph.cast(graph.add("Round", means), np.uint8)
+
+
+def _overlap_matrix(source: int, target: int) -> np.ndarray:
+    """Return how much of each source pixel each target pixel covers, [target, source]."""
+    matrix = np.zeros((target, source), np.float32)
+    for sources, weights in zip(*_overlaps(source, target), strict=True):
+        np.add.at(matrix, (np.arange(target), sources), weights)
+    return matrix
 
 
 def _resized_shape(shape: Shape, size: tuple[int, int]) -> Shape:

@@ -1,7 +1,8 @@
 """The transforms of a specification, applied to a backend's environments: components, action table, pixels, masks."""
 
 import logging
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -13,17 +14,23 @@ from daedalus.actor.environments.components import (
     ObservationComponent,
     batch_of_one,
     continuous_space,
+    exported_dtype,
     observation_components,
     only_of_batch,
     without,
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.games import GameEnvironments
+from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
 from daedalus.actor.environments.info import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed, Step
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, ObservationSpaces, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from daedalus.policy.saving.onnx_graph import OnnxGraph
 
 _CHOICE, _REST = "table", "continuous"  # components of an action of which the table gives a part
 
@@ -77,6 +84,17 @@ class TableActions:
         actions[:, self._columns] = self._table[values[_CHOICE][:, 0]]
         actions[:, self._rest] = self._rest_actions.of(values[_REST])
         return actions.reshape(len(actions), *self._space.shape)
+
+    def add_outputs(self, graph: "OnnxGraph", values: Mapping[str, str]) -> None:
+        """Add what `env_actions` does to an ONNX graph: the output `action`."""
+        choice = graph.reshaped(values[_CHOICE if self._rest.size else "action"], ())
+        actions = graph.add("Gather", graph.constant(self._table), choice, axis=0)
+        if self._rest.size:
+            actions = graph.add("Concat", actions, self._rest_actions.exported(graph, values[_REST]), axis=1)
+            order = np.argsort(np.concatenate([self._columns, self._rest]))
+            actions = graph.add("Gather", actions, graph.constant(order, np.int64), axis=1)
+        dtype = exported_dtype(self._space)
+        graph.output("action", graph.cast(actions, dtype), dtype, self._space.shape)
 
 
 def _checked_columns(columns: tuple[int, ...], space: gymnasium.spaces.Box, size: int) -> np.ndarray:
@@ -215,6 +233,35 @@ class Transforms:
                 raise ValueError(f"component {name!r} of the observation {unfit}")
         return observed
 
+    def add_inputs(self, graph: "OnnxGraph") -> tuple[dict[str, str], dict[str, str]]:
+        """Add what `observe` and the frame stacks do to an ONNX graph. Return values of observations and masks.
+
+        The inputs have the names of the components. A mask is the input action_mask, or action_mask.NAME where the
+        action has several components, also if the observation contains it.
+        """
+        values = {}
+        for component in self._observations:
+            name, frames = component.leaf.name, component.add_input(graph)
+            if name in self._pixels:
+                frames = self._pixels[name].exported(graph, frames)
+            space = self.spaces.observations[name]
+            if isinstance(space, ArraySpace) and space.frames > 1:
+                dtype = np.uint8 if space.dtype == "uint8" else np.float32
+                frames = graph.stacked(name, frames, space.shape, dtype, space.frames)
+            values[name] = frames
+        masks = {
+            name: graph.input(self.mask_input(name), np.bool_, (size,)) for name, size in self.spaces.masks.items()
+        }
+        return values, masks
+
+    def mask_input(self, action: str) -> str:
+        """Return the input of the mask of an action component; see add_inputs."""
+        return MASK_KEY if len(self.spaces.actions) == 1 else f"{MASK_KEY}.{action}"
+
+    def add_outputs(self, graph: "OnnxGraph", values: dict[str, str]) -> None:
+        """Add what `env_actions` does to an ONNX graph, for values of the run's actions."""
+        self._actions.add_outputs(graph, values)
+
     def env_actions(self, actions: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for the run's {name: [E, D]}."""
         return self._actions.env_actions(actions)
@@ -310,6 +357,11 @@ class TransformedEnvironment:
                 ignored[0],
             )
         return np.where(resets, 0.0, rewards)
+
+    def set_parameters(self, parameters: Mapping[int, Parameters]) -> None:
+        """See VectorEnvironment."""
+        assert isinstance(self._environments, GymnasiumEnvironments)  # no other backend has parameters
+        self._environments.set_parameters(parameters)
 
     @property
     def agents(self) -> tuple[str, ...]:

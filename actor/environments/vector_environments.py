@@ -4,11 +4,13 @@ The step after an episode's end ignores its action and resets. Observations are 
 stacks them. Rewards are the environment's own.
 """
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
 
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.spaces import Spaces
 
 if TYPE_CHECKING:
@@ -69,6 +71,13 @@ class VectorEnvironment(Protocol):
         In an environment whose last step ended an episode, this step only resets: reward 0 and the first frame. An
         episode that no_reward_limit ends is both terminated and truncated, and no other where that limit is set.
         Raises EnvironmentSetupError for a mask that forbids every action.
+        """
+        ...
+
+    def set_parameters(self, parameters: Mapping[int, Parameters]) -> None:
+        """Set what some of the environments, by their index, begin their next episodes with, in place of the true task.
+
+        The specification has `parameters`, with the same names.
         """
         ...
 

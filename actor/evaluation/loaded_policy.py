@@ -4,18 +4,19 @@ import copy
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.atari import pools_frames
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium, make_gymnasium
+from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
+from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.actor.environments.vector_environments import Observed
+from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
 from daedalus.actor.evaluation.episodes import RunningEpisodes
-from daedalus.policy.acting.noise import draw_noise, neutral_noise
+from daedalus.policy.acting.noise import Noise, draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.component_inputs import coded_components
 from daedalus.policy.saving.hub import pull
@@ -26,7 +27,11 @@ from daedalus.protocol.spaces import ArraySpace, unfit_code
 from daedalus.protocol.spec import RunSpec
 
 if TYPE_CHECKING:
+    from daedalus.actor.evaluation.exported_policy import ExportOptions
     from daedalus.policy.acting.value_estimator import ValueEstimator
+
+
+_Kind = TypeVar("_Kind", bound="Policy")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,7 +108,7 @@ class Policy:
         if self._pools_frames:
             observation = self._pooled(observation)
         if self._repeats_left == 0:
-            self._action = self._choose(self._observed(observation, action_mask), sampled)
+            self._action = self._choose(observation, action_mask, sampled)
             self._repeats_left = self._repeat
         self._repeats_left -= 1
         return copy.deepcopy(self._action)
@@ -149,6 +154,35 @@ class Policy:
             actions=self._transforms.env_actions(choice.actions), log_probs=choice.log_probs, **outputs._asdict()
         )
 
+    def export(
+        self,
+        path: str | Path,
+        *,
+        sampled: bool = False,
+        rows: int | None = None,
+        quantize: Literal["float16", "int8"] | None = None,
+        licence: str = "",
+    ) -> None:
+        """Write the policy as one ONNX file that runs with onnxruntime alone; see the guide "Use the policy elsewhere".
+
+        It takes observations and gives actions of the environment itself, greedy ones by default. It needs the package
+        `onnx`, and no torch.
+
+        Args:
+          path: of the file, which must not exist.
+          sampled: sample the actions, from random numbers that become an input of the file.
+          rows: observations of each call, as converters for microcontrollers need it; None: any number.
+          quantize: convert to smaller numbers. Play with the file before you trust it.
+          licence: for the metadata of the file.
+
+        Raises ExportError if that is not possible, such as for a path that exists.
+        """
+        from daedalus.actor.evaluation.exported_policy import ExportOptions, check_new, write_new
+
+        options = ExportOptions(sampled=sampled, rows=rows, quantize=quantize, licence=licence)
+        check_new(Path(path))
+        write_new(Path(path), exported_bytes(self, options))
+
     def _estimator(self) -> "ValueEstimator":
         if self._network is None:
             from daedalus.policy.acting.value_estimator import ValueEstimator  # torch, which `act` does not need
@@ -184,11 +218,40 @@ class Policy:
                 "action_mask, or train it on an environment that gives masks"
             )
 
-    def _choose(self, observed: Observed, sampled: bool) -> Any:
-        self._running.observe(observed)
+    def _choose(self, observation: Any, action_mask: Any, sampled: bool) -> Any:
         size = self._runtime.noise_size
         noise = draw_noise(size, 1, self._random) if sampled else neutral_noise(size, 1)
+        return self._decide(observation, action_mask, noise)
+
+    def _decide(self, observation: Any, action_mask: Any, noise: Noise) -> Any:
+        self._running.observe(self._observed(observation, action_mask))
         return self._transforms.env_action(self._running.act(noise).actions)
+
+
+def exported_bytes(policy: Policy, options: "ExportOptions") -> bytes:
+    """Return the ONNX file of a policy. Raises ExportError."""
+    from daedalus.actor.evaluation.exported_policy import exported_file  # `act` does not need it
+
+    caller = {
+        "repeat_each_action": policy._repeat,
+        "maximum_of_two_frames": policy._pools_frames,
+        "left_out": policy.spec.environment.leave_out,
+    }
+    spaces, size = (policy.observation_space, policy.action_space), policy._runtime.noise_size
+    return exported_file(policy._saved, policy._transforms, spaces, size, options, caller)
+
+
+def another_player(policy: Policy, kind: type[_Kind]) -> _Kind:
+    """Return another player of the same policy, of a class that derives from Policy, at the start of an episode."""
+    return kind(policy._saved, policy.observation_space, policy.action_space, policy._modules)
+
+
+def environments_of(policy: Policy) -> BackendEnvironments:
+    """Return the run's environment, of which the caller, as that of `act`, repeats the actions.
+
+    Raises EnvironmentSetupError.
+    """
+    return _make(policy.spec, policy._modules, action_repeat=1)
 
 
 def load_policy(
@@ -234,13 +297,18 @@ def load_policy(
     saved = find_policy(path, newest)
     modules = UserModules(frozenset(allow_modules), f"the run of {from_hub or saved.directory}")
     if observation_space is None or action_space is None:
-        spec = as_on_gymnasium(saved.spec.environment).model_copy(update={"processes": False})
         try:
-            modules.check(spec.user_modules)
+            modules.check(saved.spec.environment.user_modules)
         except ModuleNotAllowedError as error:
             remedy = f"if you trust that code, pass allow_modules={list(error.modules)}"
-            raise EnvironmentSetupError(f"{error.reason}; {remedy}") from None
-        environment = make_gymnasium(spec, 1, modules=modules)
+            raise EnvironmentSetupError(f"{error.reason}; {remedy}") from error
+        environment = _make(saved.spec, modules)
         environment.close()
         observation_space, action_space = environment.observation_space, environment.action_space
     return Policy(saved, observation_space, action_space, modules)
+
+
+def _make(spec: RunSpec, modules: UserModules, **changes: Any) -> BackendEnvironments:
+    """Return the environment of a run in this process, on gymnasium's implementation unless it is a game."""
+    environment = as_on_gymnasium(spec.environment).model_copy(update={"processes": False, **changes})
+    return make_bare(environment, 1, modules)[0]

@@ -181,6 +181,7 @@ class CompactSnapshotFetcher:
             policy_version=message.policy_version,
             program=message.program,
             weights=float32(bits),
+            lessons=message.lessons,
         )
 
     def _end(self, fetched: bytes | Message | None, next_at: float) -> None:

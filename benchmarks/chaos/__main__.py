@@ -9,7 +9,7 @@ import argparse
 import sys
 import time
 
-from benchmarks.chaos import actors, clocks, disk, endings, learners, network, orders, slow, wire
+from benchmarks.chaos import actors, clocks, disk, endings, league_results, learners, network, orders, slow, wire
 from benchmarks.chaos.scene import FailedError, say
 from benchmarks.running import machine, table
 
@@ -28,6 +28,7 @@ def main() -> int:
         "barriers": lambda: actors.barriers(scaled(12)),
         "freezes": lambda: actors.freezes(scaled(20)),
         "accounting": lambda: actors.accounting(scaled(30)),
+        "league": lambda: league_results.league(scaled(40)),
         "learners": lambda: learners.kills(scaled(50)),
         "ends": lambda: endings.run_ends(scaled(100)),
         "restarts": lambda: endings.restarts(scaled(100)),

@@ -1,4 +1,7 @@
-"""Actor that writes each rollout to a journal before it sends it: `python journal.py ADDRESS NAME FILE`."""
+"""Actor that writes each rollout to a journal before it sends it: `python journal.py ADDRESS NAME FILE [twice]`.
+
+With `twice` each rollout is sent two times at once, and the actor receives the answer to the first.
+"""
 
 import os
 import secrets
@@ -21,8 +24,8 @@ from daedalus.transport.interface import Transport
 class JournalTransport:
     """Transport that writes each rollout and its answer to a file before it continues."""
 
-    def __init__(self, transport: Transport, path: str) -> None:
-        self._transport = transport
+    def __init__(self, transport: Transport, path: str, *, twice: bool) -> None:
+        self._transport, self._twice = transport, twice
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 
     def query_async(
@@ -35,15 +38,22 @@ class JournalTransport:
             return
         identity = rollout.identity
         name = f"{identity.learner_epoch}/{identity.incarnation}/{identity.sequence}"
-        os.write(self._file, f"sent {name}\n".encode())
+        counts = () if rollout.matches is None else rollout.matches.counts
+        matches = sum(each.wins + each.draws + each.losses for each in counts)
+        os.write(self._file, f"sent {name} {matches}\n".encode())
 
-        def answered(answer: bytes | None) -> None:
+        def note(answer: bytes | None) -> None:
             message = None if answer is None else decode(answer, Limits())
             if isinstance(message, Acknowledgement):
-                os.write(self._file, f"answered {name} {message.verdict}\n".encode())
+                os.write(self._file, f"answered {name} {message.verdict} {message.reason}\n".encode())
+
+        def answered(answer: bytes | None) -> None:
+            note(answer)
             on_answer(answer)
 
         self._transport.query_async(key, payload, timeout=timeout, on_answer=answered)
+        if self._twice:
+            self._transport.query_async(key, payload, timeout=timeout, on_answer=note)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._transport, name)
@@ -57,7 +67,7 @@ if __name__ == "__main__":
         raise SystemExit(0)
     try:
         config = ActorConfig(name=sys.argv[2], incarnation=secrets.randbits(62))
-        journal = cast(Transport, JournalTransport(transport, sys.argv[3]))
+        journal = cast(Transport, JournalTransport(transport, sys.argv[3], twice="twice" in sys.argv[4:]))
         ActorService(config, journal, stop).run()
     finally:
         transport.close()

@@ -16,8 +16,8 @@ Compares finished runs, in one table for each environment. Runs with equal setti
 which is named after the settings in which they differ; or you name the groups, with `--` between them. A table shows
 the final return, env_steps and minutes until the mean return of the training episodes reached a threshold, and the
 probability that a run is better than one of the first group. Where training plays another task than evaluations
-(environment.training_kwargs, environment.no_reward_limit), evaluations have to reach the threshold. A folder of run
-directories stands for all of them. Runs that are left out have a line with the reason."""
+(environment.training_kwargs, environment.no_reward_limit, lessons), evaluations have to reach the threshold. A folder
+of run directories stands for all of them. Runs that are left out have a line with the reason."""
 
 _EXAMPLES = """\
 examples:

@@ -77,8 +77,14 @@ class Setting:
 
 
 def sections() -> dict[str, type[BaseModel]]:
-    """Return the model of each section of a run's settings."""
-    return {name: typing.cast(type[BaseModel], field.annotation) for name, field in RunSpec.model_fields.items()}
+    """Return the model of each section of a run's settings; that of a table of sections is `section.NAME`."""
+    models: dict[str, type[BaseModel]] = {}
+    for name, field in RunSpec.model_fields.items():
+        if get_origin(field.annotation) is dict:
+            models[f"{name}.NAME"] = get_args(field.annotation)[1]
+        else:
+            models[name] = typing.cast(type[BaseModel], field.annotation)
+    return models
 
 
 def all_settings() -> Iterator[Setting]:
@@ -99,7 +105,7 @@ def all_settings() -> Iterator[Setting]:
 
 def _matches(setting: Setting, name: str) -> bool:
     if name in RunSpec.model_fields:
-        return setting.section == name
+        return setting.section.partition(".")[0] == name
     return setting.path == name if "." in name else name in setting.key
 
 

@@ -262,6 +262,7 @@ def _table(status: RunStatus) -> list[str]:
         *_expiry(status.certificate_days_left),
         f"  {rating}return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}{agents}, "
         f"updates {status.updates:,}{skipped}",
+        *(f"  lesson {name}: {text}" for name, text in status.lessons.items()),
         *([f"  {status.bottleneck}"] if status.bottleneck else []),
         f"  {short_rate(status.env_steps_per_second)} env_steps/s, {short_rate(status.updates_per_second)} updates/s, "
         f"policy lag {policy_lag(status.policy_lag_mean, status.updates_per_batch)}",

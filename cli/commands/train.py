@@ -420,6 +420,6 @@ def _confirmed(run: LocalRun, summary: dict[str, Any]) -> list[str]:
     )
     if confirmation["interval"] is not None:
         line += ", 95 % interval {} to {}".format(*map(short_number, confirmation["interval"]))
-    if run.spec.environment.trains_true_task:
+    if run.spec.trains_true_task:
         line += f"; training mean {short_number(summary['episode_return_mean'])}"
     return [line]

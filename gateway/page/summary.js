@@ -108,6 +108,9 @@ export class Summary {
       number(metrics.newest("evaluation_return_mean")),
       evaluated === null ? "none yet" : `± ${number(metrics.newest("evaluation_return_std"))} at ${number(evaluated)} env_steps`,
     );
+    for (const [name, text] of Object.entries(status.lessons)) {
+      this.#tile(`Lesson ${name}`, number(metrics.newest(`lesson/${name}`)), `now ${text}`);
+    }
     this.#tile("env_steps/s", number(status.env_steps_per_second), `${number(status.updates_per_second)} updates/s`);
     const [lag, inUpdates] = policyLag(status.policy_lag_mean, status.updates_per_batch);
     this.#tile("Policy lag", lag, `${inUpdates ? `${inUpdates}, ` : ""}mean of the newest batches`);

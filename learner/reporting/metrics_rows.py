@@ -86,6 +86,7 @@ MEANS = {
 ENV = "env/"  # scalars of the environment's info
 USER = "user/"  # metrics of the program that started the run
 WIN_RATE = "win_rate/"  # of the newest policy against a fixed opponent
+LESSON = "lesson/"  # the mean value of a parameter that has a lesson, over the newest episodes
 MAX_COLUMNS = 1024  # that are read; a program of the user's may name a new metric in every row
 
 
@@ -119,7 +120,7 @@ class MetricsWriter(Protocol):
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """Write a row. Raises OSError.
 
-        Its keys are in COLUMNS, or begin with ENV, USER or WIN_RATE. Columns without a value yet are absent.
+        Its keys are in COLUMNS, or begin with ENV, USER, WIN_RATE or LESSON. Columns without a value yet are absent.
         """
         ...
 

@@ -12,7 +12,7 @@ import numpy as np
 from daedalus.learner.reporting.bottleneck import bottleneck
 from daedalus.learner.reporting.csv_writer import cut_rows
 from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint
-from daedalus.learner.reporting.metrics_rows import ENV, Details, league_columns, read_rows
+from daedalus.learner.reporting.metrics_rows import ENV, LESSON, Details, league_columns, read_rows
 from daedalus.learner.reporting.rates import RateMeter
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
@@ -127,6 +127,7 @@ class RunReporter:
                 "entropy_bonus": learner.entropy_bonus(progress),
                 **self._user_metrics.take(),
                 **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
+                **{LESSON + name: mean for name, mean in context.lessons.means().items()},
             }
         self._learning_hint.add(row)
         return row
@@ -210,6 +211,7 @@ class RunReporter:
             learning_share=rates.learning_share,
             decoding_share=rates.decoding_share,
             league=self._league(),
+            lessons=context.lessons.texts(counters.env_steps),
         )
 
     def summary(self, *, finished: bool, now: float, stopped_by: str = "") -> dict[str, Any]:
@@ -246,6 +248,7 @@ class RunReporter:
             "snapshots_published": counters.snapshots_published,
             "bottleneck": self._bottleneck,
             **({} if league is None else {"league": league.model_dump(mode="json")}),
+            **({"lessons": lessons} if (lessons := self._context.lessons.texts(counters.env_steps)) else {}),
         }
 
     def write_summary(

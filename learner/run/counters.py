@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
 from daedalus.learner.league.ratings import LeagueState
+from daedalus.learner.run.lesson_progress import LessonState
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Rollout, Upload
 
@@ -63,6 +64,9 @@ _Count = Annotated[int, Field(ge=0, lt=2**63)]
 _COUNTS = TypeAdapter(dict[str, _Count], config={"strict": True})  # of _SAVED
 
 
+_LESSONS = TypeAdapter(dict[str, LessonState])
+
+
 class _State(BaseModel, strict=True):
     """The other values of RunCounters.state, and what RunContext.saved adds."""
 
@@ -81,8 +85,14 @@ def check_counters(state: Any) -> dict[str, Any]:
     _State.model_validate(state)
     if state.get("league") is not None:
         LeagueState.model_validate(state["league"])
+    lesson_states(state)
     _COUNTS.validate_python({name: state[name] for name in _SAVED if name in state or name == "env_steps"})
     return state
+
+
+def lesson_states(state: dict[str, Any]) -> dict[str, LessonState]:
+    """Return the states of lessons in what RunContext.saved returned. Raises ValueError."""
+    return _LESSONS.validate_python(state.get("lessons", {}))  # absent in checkpoints of earlier releases
 
 
 @dataclass(slots=True)
@@ -174,7 +184,7 @@ class RunCounters:
         """
         target, best = spec.training.target_return, self.best_evaluation
         evaluated = target is not None and best is not None and best >= target
-        if not spec.environment.trains_true_task:
+        if not spec.trains_true_task:
             return evaluated
         return (spec.training.explores and evaluated) or self.reached(target)
 

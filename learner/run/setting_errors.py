@@ -137,11 +137,15 @@ def known_names(path: list[str]) -> list[str]:
 def _model(path: list[str]) -> type[BaseModel] | None:
     model: Any = RunSpec
     for part in path:
+        if get_origin(model) is dict:  # of models by name
+            model = get_args(model)[1]
+            continue
         field = model.model_fields.get(part)
-        if field is None or not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+        model = None if field is None else field.annotation
+        values = get_args(model)[1:] if get_origin(model) is dict else [model]
+        if not all(isinstance(each, type) and issubclass(each, BaseModel) for each in values):
             return None
-        model = field.annotation
-    return model
+    return model if isinstance(model, type) else None
 
 
 def _field(path: list[str]) -> FieldInfo | None:

@@ -280,13 +280,13 @@ def changed_settings(settings: Mapping[str, Any]) -> list[str]:
 
 def unmeasured_target(spec: RunSpec) -> str:
     """Return why a run without evaluations cannot reach its target, or an empty string."""
-    true_task, target = spec.environment.trains_true_task, spec.training.target_return
+    true_task, target = spec.trains_true_task, spec.training.target_return
     if true_task or target is None or spec.evaluation.seconds is not None:
         return ""
     return (
-        f"training.target_return is {target:g}, but training plays another task (environment.training_kwargs or "
-        "environment.no_reward_limit), whose returns say nothing about the target: set evaluation.seconds, such as 30, "
-        "or training.target_return=none"
+        f"training.target_return is {target:g}, but training plays another task (environment.training_kwargs, "
+        "environment.no_reward_limit or lessons), whose returns say nothing about the target: set evaluation.seconds, "
+        "such as 30, or training.target_return=none"
     )
 
 

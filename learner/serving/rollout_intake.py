@@ -168,7 +168,7 @@ class RolloutIntake:
         self._spec, self._lock = context.spec, context.lock
         self._fleet, self._counters, self._events = context.fleet, context.counters, context.events
         self._version = context.start_version  # rollouts of this version have a policy lag of 0
-        self._league = context.league
+        self._league, self._lessons = context.league, context.lessons
         # Number of updates of a batch. A learner with a replay buffer sets its own.
         self.updates_of: Callable[[Sequence[Upload]], int] = self._updates_of
         self._judge = RolloutJudge(context.spec, context.learner_epoch, context.fleet, context.league)
@@ -328,6 +328,7 @@ class RolloutIntake:
             return
         updates = self.updates_of(taken.rollouts)
         self._counters.trained(taken.rollouts, version, updates)
+        self._lessons.add(taken.rollouts, self._counters.env_steps)
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
                 actors[rollout.identity.actor].env_steps += rollout.env_steps
@@ -402,15 +403,12 @@ class RolloutIntake:
             request.reply(encode(replace(answer, policy_version=self._published_version())))
 
     def _decide(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
-        if self._is_surplus(content):
-            content = Rejected(
-                verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor, or is full"
-            )
-        if not isinstance(content, Rejected):
+        surplus = self._is_surplus(content)
+        if not isinstance(content, Rejected) and not surplus:
             self._buffer.heard(sender)
-        verdict = self._judge.decide(sender, content, self._version, time.monotonic())
+        verdict = self._judge.decide(sender, content, self._version, time.monotonic(), surplus=surplus)
         self._fleet.received(sender, size)
-        if not isinstance(verdict, Rejected) or verdict.cause == "stale":
+        if not isinstance(verdict, Rejected) or verdict.cause in ("stale", "surplus"):
             self._count_matches(content)
         if isinstance(verdict, Rejected):
             self._count_rejection(sender, verdict)
@@ -421,7 +419,7 @@ class RolloutIntake:
         return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
 
     def _count_matches(self, content: Upload | Rejected) -> None:
-        """Count the results of matches in a rollout that was received for the first time, however old its policy is."""
+        """Count the results of matches in a rollout that was received for the first time, even if not learned from."""
         if self._league is not None and isinstance(content, Rollout) and content.matches is not None:
             self._league.add(content.matches)
 

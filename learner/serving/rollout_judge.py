@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from daedalus.learner.league.run_league import League
+from daedalus.learner.run.lesson_progress import lessons_violation
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.upload_checks import (
     Shapes,
@@ -139,7 +140,9 @@ class RolloutJudge:
         violation = self._first_violation(upload, spaces, actor)
         return Rejected(verdict="rejected", cause="unfit", reason=violation) if violation else upload
 
-    def decide(self, sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
+    def decide(
+        self, sender: str, content: Upload | Rejected, policy_version: int, now: float, *, surplus: bool = False
+    ) -> Upload | Rejected:
         """Decide on a result of `read`, count the verdict, and return it. The caller holds the lock.
 
         Args:
@@ -147,8 +150,14 @@ class RolloutJudge:
           content: result of `read`.
           policy_version: newest policy version; the policy lag is relative to it.
           now: time on the monotonic clock, in seconds.
+          surplus: whether the batch has no room for a rollout of this actor.
         """
-        verdict = content if isinstance(content, Rejected) else self._judge(sender, content, policy_version, now)
+        verdict = content
+        if not isinstance(content, Rejected):
+            verdict = self._judge(sender, content, policy_version, now)
+        if surplus and not isinstance(verdict, Rejected):
+            reason = "the batch already has a rollout of this actor, or is full"
+            verdict = Rejected(verdict="rejected", cause="surplus", reason=reason)
         actor = self._fleet.actors.get(sender)
         if actor is not None:
             actor.heard(now)
@@ -218,7 +227,7 @@ class RolloutJudge:
         rows = self._spec.collection.rollout_length * min(upload.identity.sequence + 1, _LOST * (actor.uploads + 1))
         if actor.environments == 1 or self._spec.algorithm.synchronous or self._spec.environment.is_game:
             rows += int(_CLIENT_ROWS * (now - actor.joined + _BEGIN_SECONDS))
-        if actor.matches + matches > rows * (actor.environments + 1):  # one copy of the game may only rate
+        if actor.matches + matches > rows * 2 * actor.environments:  # as many copies of the game may only rate
             return f"it reports {matches} matches, and {actor.matches} before, but has played at most {rows} rows"
         longest, total = int(lengths.max(initial=0)), sum(lengths.tolist())
         if longest > rows or actor.episode_rows + total > rows * actor.environments:
@@ -254,19 +263,29 @@ class RolloutJudge:
         size = rows * row + 4 * self.state_size
         for space in spaces.observations.values():
             size += (rows + space.frames) * math.prod(space.shape) * np.dtype(space.dtype).itemsize
-        arrays = _OTHER_ARRAYS + len(spaces.observations) + 2 * len(spaces.actions) + MAX_INFO_NAMES
+        arrays = (
+            _OTHER_ARRAYS
+            + len(spaces.observations)
+            + 2 * len(spaces.actions)
+            + MAX_INFO_NAMES
+            + len(self._spec.lessons)
+        )
         return Limits(max_bytes=environments * size + _SLACK_BYTES, max_arrays=arrays)
 
     def _first_violation(self, rollout: Upload, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
         if isinstance(rollout, Gradient):
-            return gradient_violation(rollout, self._spec, self.gradient_shapes, spaces, actor.environments)
+            shapes = self.gradient_shapes
+            return gradient_violation(rollout, self._spec, shapes, spaces, actor.environments) or lessons_violation(
+                rollout, self._spec
+            )
         return (
             self._shape_violation(rollout, actor)
             or first_component_violation(rollout, spaces, self._spec.policy)
             or _number_violation(rollout)
             or self._value_violation(rollout)
             or _episode_violation(rollout)
+            or lessons_violation(rollout, self._spec)
         )
 
     def _shape_violation(self, rollout: Rollout, actor: Actor) -> str:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 from daedalus.learner.league.ratings import LeagueState
 from daedalus.learner.league.run_league import League
 from daedalus.learner.reporting.thinning import MetricsHistory
-from daedalus.learner.run.counters import Annealing, RunCounters
+from daedalus.learner.run.counters import Annealing, RunCounters, lesson_states
+from daedalus.learner.run.lesson_progress import LessonProgress
 from daedalus.learner.run.run_directory import run_name
 from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.serving.events import EventLog
@@ -139,6 +140,7 @@ class RunContext:
     events: EventLog
     history: MetricsHistory
     league: League | None  # of a game
+    lessons: LessonProgress
 
     @classmethod
     def begin(
@@ -164,7 +166,7 @@ class RunContext:
         started = time.monotonic() if started is None else started
         training, counters = spec.training, RunCounters(spec.training.target_episodes)
         starts, version, annealing, other_episodes = 1, 0, Annealing(budget=training.env_steps), False
-        league_state = None
+        league_state, lessons = None, LessonProgress(spec)
         if restored is not None:
             saved, before = restored.counters, restored.policy.spec
             starts, version, spaces = saved.get("starts", 0) + 1, restored.policy.policy_version, restored.policy.spaces
@@ -178,6 +180,7 @@ class RunContext:
             annealing = annealing.resumed(counters.env_steps, training.env_steps)
             if saved.get("league") is not None:  # absent in early ones
                 league_state = LeagueState.model_validate(saved["league"])
+            lessons = LessonProgress(spec, lesson_states(saved))
         epoch = new_epoch(starts)
         return cls(
             directory=directory,
@@ -198,6 +201,7 @@ class RunContext:
             events=EventLog(),
             history=MetricsHistory(),
             league=League(directory, spec, epoch, league_state) if spec.environment.is_game else None,
+            lessons=lessons,
         )
 
     @property
@@ -225,4 +229,5 @@ class RunContext:
         counters = self.counters.state(self.wall_seconds(now))
         state = None if self.league is None else self.league.state()
         league = {} if state is None else {"league": state.model_dump(mode="json")}
-        return {**counters, "annealing": self.annealing.model_dump(), "starts": self.starts, **league}
+        lessons = {"lessons": states} if (states := self.lessons.states()) else {}
+        return {**counters, "annealing": self.annealing.model_dump(), "starts": self.starts, **league, **lessons}

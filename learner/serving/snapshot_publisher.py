@@ -141,6 +141,7 @@ def _encoded(snapshot: Snapshot, bits: Bits, held: int | None, base: Bits | None
             program=snapshot.program,
             base_version=held,
             weights=planes(bits, base),
+            lessons=snapshot.lessons,
         )
     )
 
@@ -295,6 +296,7 @@ class SnapshotPublisher:
                 policy_version=policy_version,
                 program=self.offered.hash if self.offered else "",
                 weights={**weights, **self.extras()},
+                lessons=self._context.lessons.plan(self._context.counters.env_steps),
             )
         )
         if not self._ended:

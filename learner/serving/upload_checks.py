@@ -134,8 +134,9 @@ def gradient_limits(spec: RunSpec, shapes: Shapes, spaces: Spaces, environments:
     discrete = [space for space in spaces.actions.values() if isinstance(space, DiscreteSpace)]
     size += sum(8 * space.choices + _ARRAY_BYTES for space in discrete)
     episodes = spec.collection.rollout_length * environments
-    size += 12 * episodes + MAX_INFO_NAMES * (4 * MAX_INFO_VALUES + _ARRAY_BYTES) + _MAX_METRICS * _ARRAY_BYTES
-    arrays = len(shapes) + len(moments) + len(discrete) + MAX_INFO_NAMES + _MAX_METRICS + 2
+    size += (12 + 8 * len(spec.lessons)) * episodes + len(spec.lessons) * _ARRAY_BYTES
+    size += MAX_INFO_NAMES * (4 * MAX_INFO_VALUES + _ARRAY_BYTES) + _MAX_METRICS * _ARRAY_BYTES
+    arrays = len(shapes) + len(moments) + len(discrete) + MAX_INFO_NAMES + _MAX_METRICS + len(spec.lessons) + 2
     return Limits(max_bytes=size, max_arrays=arrays)
 
 

@@ -172,8 +172,10 @@ class Checkpointer:
     def _training_score(self) -> TrainingScore | None:
         """Return the mean return of the newest training episodes, if there are enough of them and nobody evaluates.
 
-        None where the policy plays itself: its newest version counts as the best.
+        None where the policy plays itself, or lessons make the task harder: its newest version counts as the best.
         """
+        if self._spec.lessons:
+            return None
         if self._context.league is not None and self._context.league.has_begun:
             return None
         counters = self._context.counters
@@ -183,7 +185,7 @@ class Checkpointer:
             return None
         if time.monotonic() < self._context.evaluations.heard + silence:
             return None
-        return TrainingScore(return_mean=mean, episodes=episodes, true_task=self._spec.environment.trains_true_task)
+        return TrainingScore(return_mean=mean, episodes=episodes, true_task=self._spec.trains_true_task)
 
     def add(self, job: Callable[[], None]) -> None:
         """Let the thread that writes do something, after what it was given before."""

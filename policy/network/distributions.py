@@ -117,7 +117,7 @@ class Categorical(Distribution):
     def sample(self, parameters: Tensor, uniform: Tensor, normal: Tensor) -> Tensor:
         """See Distribution."""
         gumbel = -torch.log(-torch.log(uniform.clamp(min=_SMALLEST)))
-        return (self._by_variable(parameters) + self._by_variable(gumbel)).argmax(-1)  # [N, D]
+        return self._by_variable(parameters + gumbel).argmax(-1)  # [N, D]
 
     def log_prob(self, parameters: Tensor, actions: Tensor) -> Tensor:
         """See Distribution: sum_d log pi_d(a_d | s)."""
@@ -144,6 +144,8 @@ class Categorical(Distribution):
 
     def _by_variable(self, values: Tensor) -> Tensor:
         """Arrange values of all choices [..., P] by variable [..., D, A], A being the largest number of choices."""
+        if len(self._counts) == 1:
+            return values.unsqueeze(-2)
         if self._equal:
             return values.unflatten(-1, (len(self._counts), self._counts[0]))
         columns, missing = self._columns.to(values.device), self._missing.to(values.device)

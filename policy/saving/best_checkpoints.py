@@ -26,13 +26,15 @@ class TrainingScore:
 
     return_mean: float
     episodes: int
-    true_task: bool = True  # whether training plays the task of evaluations (EnvironmentSpec.trains_true_task)
+    true_task: bool = True  # whether training plays the task of evaluations (RunSpec.trains_true_task)
 
     @property
     def of(self) -> str:
         """What the score is of."""
         other = (
-            "" if self.true_task else ", of another task (environment.training_kwargs or environment.no_reward_limit)"
+            ""
+            if self.true_task
+            else ", of another task (environment.training_kwargs, environment.no_reward_limit or lessons)"
         )
         return f"the newest {self.episodes} training episodes{other}"
 

@@ -286,6 +286,9 @@ class Seeds(PlainPolicy):
     def step(self, actions: dict[str, np.ndarray]) -> Step:
         return self._observed(), np.zeros(1), np.zeros(1, np.bool_), np.zeros(1, np.bool_)
 
+    def set_parameters(self, parameters: Any) -> None:
+        raise AssertionError("the run has no parameters")
+
     def take_episode_info(self) -> dict[str, np.ndarray]:
         return {}
 

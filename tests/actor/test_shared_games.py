@@ -220,11 +220,19 @@ def _together(*calls: Callable[[], None]) -> None:
 
 
 def test_a_run_that_returns_with_other_settings_is_refused() -> None:
-    games = SharedGames({"one": ("agent_0",), "two": ("agent_1",)}, modules=MODULES)
+    plays = ("agent_0", "agent_1")
+    games, spec = SharedGames({"one": plays}, modules=MODULES), run_spec("Together", 7, 2, plays)
     collector = RoleCollector(games, "one", modules=MODULES)
-    collector.prepare(run_spec("Together", 7, 2, ("agent_0",)))
-    with pytest.raises(ActorError, match="'one' has other settings than before"):
-        collector.prepare(run_spec("Together", 7, 2, ("agent_0",), length=5))
+    collector.prepare(spec)
+    collector.begin(Counting(), spec, seed=1)
+    collector.load(snapshot(0, {}))
+    collector.collect(IDENTITY)
+    for returns in (
+        lambda: collector.prepare(run_spec("Together", 7, 2, plays, length=5)),
+        lambda: collector.begin(Counting(), spec, seed=1, epsilon=0.5),
+    ):
+        with pytest.raises(ActorError, match="'one' has other settings than before"):
+            returns()
     games.close()
 
 

@@ -53,7 +53,7 @@ def test_the_script_is_valid_bash(script: Path) -> None:
     ("line", "expected"),
     [
         ("daedalus tra", {"train"}),
-        ("daedalus e", {"evaluate", "exporter"}),
+        ("daedalus e", {"evaluate", "export", "exporter"}),
         ("daedalus train --alg", {"--algorithm"}),
         ("daedalus train --algorithm im", {"impala"}),
         ("daedalus train cartp", {name for name in preset_names() if name.startswith("cartp")}),

@@ -4,18 +4,23 @@ import importlib
 import json
 import sys
 import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from allowed_modules import TEST_MODULES
+from browser import Visit, chromium
 from building import SPACES, make_rollouts
 from pages import DOCS, ROOT, code_blocks
 from plain import PlainEnvironments, act, choices, plain_spaces
 from recorded_runs import record
+from saved_runs import CARTPOLE, save
 
+import daedalus
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.bots import make_bot
 from daedalus.actor.environments.make import make_environments
@@ -56,6 +61,54 @@ def test_the_environment_can_be_played(folder: Path) -> None:
     assert steps[-1][1].tolist() == [0.99, -0.01]
     assert steps[-1][2].tolist() == [True, False]
     environments.close()
+
+
+def test_an_exported_policy_plays_with_onnxruntime_alone(folder: Path) -> None:
+    save(folder / "run", CARTPOLE, 1)
+    save(folder / "stacked", CARTPOLE.model_copy(update={"frame_stack": 3}), 1, policy={"memory": "gru"})
+    daedalus.load_policy("run").export("cartpole.onnx")
+    code = example("export.md")
+    assert len([line for line in code.splitlines() if line]) <= 10
+    played: dict[str, Any] = {}
+    exec(code, played)
+    assert played["ended"]
+    policy = daedalus.load_policy("stacked")
+    policy.export("policy.onnx")
+    remembering: dict[str, Any] = {}
+    exec(example("export.md", number=1), remembering)
+    state = remembering["start"]
+    for observation in np.random.default_rng(1).normal(size=(20, 4)).astype(np.float32):
+        action, state = remembering["act"](observation, state)
+        assert action == policy.act(observation)
+
+
+def test_an_exported_policy_plays_in_a_browser(folder: Path) -> None:
+    packages = ROOT / "tests" / "gateway" / "node_modules"
+    if not (packages / "onnxruntime-web").is_dir():
+        pytest.skip("onnxruntime-web is not installed: run `make examples`")
+    policy = daedalus.load_policy(save(folder / "run", CARTPOLE, 1))
+    policy.export("cartpole.onnx")
+    (folder / "page.html").write_text('<link rel="icon" href="data:,">' + example("export.md", "html"))
+    (folder / "node_modules").symlink_to(packages)
+    handler = partial(QuietHandler, directory=folder)
+    with chromium() as browser, ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever).start()
+        visit = Visit(browser, f"http://127.0.0.1:{server.server_port}/page.html")
+        try:
+            visit.page.wait_for_function("document.title.startsWith('action')")
+            expected = policy.act(np.array([0, 0, 0.05, 0], np.float32))
+            assert visit.page.title() == f"action {expected}"
+            assert (visit.complaints, visit.strange_requests) == ([], [])
+        finally:
+            visit.close()
+            server.shutdown()
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """A web server that logs nothing."""
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
 
 
 def test_the_game_can_be_played(folder: Path) -> None:

@@ -265,7 +265,7 @@ def test_training_returns_of_another_task_are_called_so(tmp_path: Path, settings
     run = Run(tmp_path, spec.model_copy(update={"environment": spec.environment.model_copy(update=settings)}))
     collapse(run, 5.0)
     score = SealedDirectory(checkpoints(tmp_path)[0]).content["score"]
-    task = ", of another task (environment.training_kwargs or environment.no_reward_limit)" if other else ""
+    task = ", of another task (environment.training_kwargs, environment.no_reward_limit or lessons)" if other else ""
     assert score["of"] == f"the newest 100 training episodes{task}"
 
 

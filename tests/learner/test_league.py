@@ -276,13 +276,26 @@ class Sent:
         self.answer = decode(payload, Limits())
 
 
-def test_each_rollout_counts_its_results_once_also_if_it_is_too_old_to_learn_from(tmp_path: Path) -> None:
-    context = run_context(game_spec(), tmp_path, fleet=joined_fleet("a"), start_version=50)
+@pytest.mark.parametrize(
+    ("algorithm", "rollouts", "counted"),
+    [
+        ("impala", [(0, 50), (1, 10), (0, 50), (1, 10), (2, 50), (7, 51), (3, 50)], 1111),  # two are too old to learn
+        ("a2c", [(0, 50), (1, 50), (0, 50), (1, 50), (2, 10)], 111),  # the batch has room for one
+    ],
+)
+def test_each_rollout_counts_its_results_once_also_if_it_is_not_learned_from(
+    tmp_path: Path, algorithm: str, rollouts: list[tuple[int, int]], counted: int
+) -> None:
+    spec = game_spec()
+    training = spec.training.model_copy(update={"algorithm": algorithm})
+    context = run_context(
+        spec.model_copy(update={"training": training}), tmp_path, fleet=joined_fleet("a"), start_version=50
+    )
     assert context.league is not None
-    intake, old = RolloutIntake(context, lambda: 50), 10
+    intake = RolloutIntake(context, lambda: 50)
     intake.open()
     try:
-        for sequence, version in [(0, 50), (1, old), (0, 50), (1, old), (2, 50), (7, 51), (3, 50)]:
+        for sequence, version in rollouts:
             results = matches(NEWEST, "random", 10**sequence)
             sent = Sent(make_rollout(identity("a", sequence), version=version, matches=results))
             intake.offer(sent)
@@ -293,7 +306,7 @@ def test_each_rollout_counts_its_results_once_also_if_it_is_too_old_to_learn_fro
         intake.close()
     status = context.league.status()
     assert status is not None
-    assert status.players[0].matches == 1111
+    assert status.players[0].matches == counted
 
 
 # ------------------------------------------------------------------------------------------------- whole runs

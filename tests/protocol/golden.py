@@ -11,6 +11,7 @@ import numpy as np
 from daedalus.protocol.codec import FIRST_VERSION, encode
 from daedalus.protocol.compact import bfloat16, planes
 from daedalus.protocol.league import Plan, PlannedOpponent, PlannedRating
+from daedalus.protocol.lessons import LessonPlan, LessonRange
 from daedalus.protocol.messages import (
     Acknowledgement,
     ActorsPage,
@@ -172,6 +173,21 @@ MESSAGES: dict[str, Message] = {
     "snapshot_request": SnapshotRequest(actor="wing-1", held_version=33, policy_version=41, part=2),
     "snapshot_request_first": SnapshotRequest(actor="wing-1", held_version=None),
     "snapshot_request_whole": SnapshotRequest(actor="wing-1", held_version=40, compact=False),
+    "snapshot_lessons": Snapshot(
+        learner_epoch=2**60 + 3,
+        policy_version=41,
+        program="ab" * 32,
+        weights={"layer.weight": np.array([[1.5, -2.0]], np.float32)},
+        lessons=LessonPlan(
+            ranges={
+                "gravity": (
+                    LessonRange(low=5.5, high=9.75, weight=0.25),
+                    LessonRange(low=9.75, high=14.0, weight=0.75),
+                ),
+                "goals": (LessonRange(low=2.0, high=2.0),),
+            }
+        ),
+    ),
     "league_request": LeagueRequest(actor="wing-1", held_revision=4),
     "league_request_player": LeagueRequest(actor="wing-1", player="v33"),
     "league_plan": LeaguePlan(

@@ -81,6 +81,9 @@ class Films:
     def reset(self, seed: int) -> Observed:
         return Observed({NAME: self.played.reset(seed=seed)[0]}, {})
 
+    def set_parameters(self, parameters: Any) -> None:
+        raise AssertionError("the run has no parameters")
+
     def take_episode_info(self) -> dict[str, np.ndarray]:
         return {}
 

@@ -1,0 +1,140 @@
+"""Parameters that the learner sets: how actors apply, draw and acknowledge them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from allowed_modules import TEST_MODULES
+from collectors import collect, snapshot, started_collector
+from plain import PlainPolicy
+
+from daedalus.actor.checking.play import check_environment
+from daedalus.actor.collecting.client_rows import check_run
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.make import make_environments
+from daedalus.actor.errors import ActorError
+from daedalus.protocol.lessons import LessonPlan, LessonRange, LessonSpec
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.uploads import Rollout
+
+LESSONS = {"stones": LessonSpec(between=(1, 5))}
+
+
+def path(name: str = "Path", **more: Any) -> EnvironmentSpec:
+    values = {"id": f"lesson_environment:{name}", "kwargs": {"always_opens": True}, "parameters": {"stones": 7}}
+    return EnvironmentSpec.model_validate({**values, **more})
+
+
+def plan(*ranges: tuple[float, float]) -> LessonPlan:
+    return LessonPlan(ranges={"stones": tuple(LessonRange(low=low, high=high) for low, high in ranges)})
+
+
+def played(rollout: Rollout) -> list[int]:
+    """Return the acknowledged parameter of each episode, which an episode of this length proves."""
+    stones = rollout.lessons["stones"]
+    assert stones.tolist() == rollout.episode_lengths.tolist()
+    return stones.astype(int).tolist()
+
+
+@pytest.mark.parametrize("more", [{}, {"id": "lesson_environment:PathWithMethod"}, {"processes": True}])
+def test_each_episode_has_the_parameter_that_its_rollout_acknowledges(more: dict[str, Any]) -> None:
+    options: dict[str, Any] = {"count": 3, "rollout_length": 40, "lessons": LESSONS, "plan": plan((1, 2), (5, 5))}
+    collector = started_collector(path(**more), PlainPolicy(), **options)
+    first = played(collect(collector))
+    assert set(first) == {1, 2, 5}
+    collector.load(snapshot(1, {}, plan((3, 3))))
+    second = played(collect(collector))
+    assert set(second[3:]) == {3}  # the three episodes that had begun go on with what they began with
+    collector.load(snapshot(2, {}))  # without a plan, such as while a learner resumes: the old one goes on
+    assert set(played(collect(collector))[3:]) == {3}
+    collector.close()
+    again = started_collector(path(**more), PlainPolicy(), **options)
+    assert played(collect(again)) == first  # drawn by the seed of the actor
+    again.close()
+
+
+def test_evaluations_play_the_true_task_and_a_run_without_lessons_acknowledges_none() -> None:
+    environments = make_environments(path().as_evaluated(), 1, modules=TEST_MODULES, one_episode=True)
+    environments.reset(3)
+    ends = [environments.step({"action": np.zeros((1, 1), np.uint8)})[2].any() for _ in range(7)]
+    assert ends == [False] * 6 + [True]
+    collector = started_collector(path(), PlainPolicy(), rollout_length=20)
+    rollout = collect(collector)
+    assert rollout.lessons == {}
+    assert set(rollout.episode_lengths.tolist()) == {7}
+
+
+METHOD = "lesson_environment:PathWithMethod"
+FAULTS = [
+    (
+        path(parameters={"stone": 3}),
+        "has no parameter stone: reset reads stones of its options, and the environment has no method set_parameters; "
+        "did you mean stones?",
+    ),
+    (path(id=METHOD, parameters={"x": 3}), "has no parameter x: its set_parameters takes stones; correct "),
+    (
+        path(id=METHOD, parameters={"stones": 101}),
+        "set_parameters(stones=101) raises ValueError: at most 100 stones fit",
+    ),
+    (path(parameters={"stones": -3}), "reset with the options stones=-3 raises ValueError: "),
+    (EnvironmentSpec(id="CartPole-v1", parameters={"lov": -0.1}), "reset reads high, low of its options"),
+]
+
+
+def made_and_reset(environment: EnvironmentSpec) -> None:
+    made = make_environments(environment, 2, modules=TEST_MODULES)
+    try:
+        made.reset(1)
+    finally:
+        made.close()
+
+
+@pytest.mark.parametrize(("environment", "fault"), FAULTS)
+def test_a_parameter_that_the_environment_does_not_have_is_named_before_a_run(
+    environment: EnvironmentSpec, fault: str
+) -> None:
+    report = check_environment(environment, TEST_MODULES, seconds=0.1, env_steps=10)
+    assert fault in report.problems[0]
+    with pytest.raises(EnvironmentSetupError) as error:
+        made_and_reset(environment)
+    assert fault in str(error.value)
+
+
+def test_a_process_names_a_parameter_that_its_environment_does_not_have() -> None:
+    with pytest.raises(EnvironmentSetupError, match="has no parameter stone: reset reads stones"):
+        made_and_reset(path(parameters={"stone": 3}, processes=True))
+
+
+@pytest.mark.parametrize("way", ["item", "merged", "merging", "keywords", "copied", "updated"])
+def test_options_may_be_read_in_any_way(way: str) -> None:
+    spec = path("Odd", kwargs={"way": way})
+    assert check_environment(spec, TEST_MODULES, seconds=0.1, env_steps=5).problems == ()
+
+
+def test_a_range_that_this_host_refuses_is_named_when_the_actor_joins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MOST_STONES", "9")
+    between = {"stones": LessonSpec(between=(1, 20))}
+    with pytest.raises(EnvironmentSetupError) as error:
+        started_collector(path("PathWithMethod"), PlainPolicy(), count=2, rollout_length=4, lessons=between)
+    assert "set_parameters(stones=20) raises ValueError: at most 9 stones fit here" in str(error.value)
+
+
+def test_environments_that_share_a_vector_entry_point_are_made_one_by_one() -> None:
+    """CartPole's reset reads `low` and `high`, and its own vector entry point has one pair for all environments."""
+    spec = EnvironmentSpec(id="CartPole-v1", parameters={"low": -0.01, "high": 0.01})
+    lessons = {"low": LessonSpec(between=(-0.2, -0.1)), "high": LessonSpec(between=(0.1, 0.2))}
+    ranges = {"low": (LessonRange(low=-0.2, high=-0.1),), "high": (LessonRange(low=0.1, high=0.2),)}
+    collector = started_collector(
+        spec, PlainPolicy(), count=2, rollout_length=64, lessons=lessons, plan=LessonPlan(ranges=ranges)
+    )
+    rollout = collect(collector)
+    assert ((rollout.lessons["low"] > -0.2) & (rollout.lessons["low"] < -0.1)).all()
+    assert len(set(rollout.lessons["high"].tolist())) == len(rollout.episode_returns) > 1
+
+
+def test_clients_and_older_actors_refuse_a_run_with_lessons() -> None:
+    """A client's environment is its own; an older actor finds settings in `changed` that it does not know."""
+    spec = RunSpec(environment=path(), lessons=LESSONS).for_actors()
+    assert {"environment.parameters", "lessons"} <= set(spec.changed)
+    with pytest.raises(ActorError, match="this run has lessons for stones, and a client's own loop makes its"):
+        check_run(spec)
