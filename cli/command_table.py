@@ -72,7 +72,7 @@ COMMANDS = {
     "resume": Command("commands.train:resume_parser", "commands.train:resume"),
     "sweep": Command("commands.sweep:parser", "commands.sweep:sweep"),
     "check": Command("commands.check:parser", "commands.check:check"),
-    "settings": Command("commands.settings_command:parser", "commands.settings:settings"),
+    "settings": Command("commands.settings_command:parser", "commands.settings_command:settings"),
     "learner": Command("commands.learner:parser"),
     "actor": Command("commands.actor:parser"),
     "router": Command("commands.router:parser", "commands.router:router"),

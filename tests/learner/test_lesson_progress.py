@@ -56,7 +56,7 @@ def test_only_episodes_with_the_present_value_lead_to_the_next_one() -> None:
     lessons.add([episodes((1.0, 0.0))], 8)
     assert drawn(lessons) == [(5.0, 5.0, 1.0)]
     assert lessons.texts(8) == {NAME: "5 (step 2 of 3)"}
-    lessons.add([episodes(*[(1.0, 1.0)] * 9)], 9)  # begun before
+    lessons.add([episodes(*[(1.0, 1.0)] * 3, (5.0, 0.0))], 9)  # three have begun before
     assert drawn(lessons) == [(5.0, 5.0, 1.0)]
     lessons.add([episodes(*[(5.0, 0.0)] * 9, *[(5.0, 1.0)] * 2)], 10)  # the newest four have 0.5
     assert drawn(lessons) == [(10.0, 10.0, 1.0)]
