@@ -58,12 +58,12 @@ class GradientComputer:
     def __init__(self, spec: LossSpec, network: ActorCritic, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
         """Raise AlgorithmError if the user's own algorithm cannot be used; `modules` may be imported for it."""
         self._spec, self._network = spec, network
-        self._algorithm = build_algorithm(spec, network.distribution, modules)
+        self.algorithm = build_algorithm(spec, network.distribution, modules)
         self.parameters = FlatParameters(network.learned_parameters())
         self.forward = Forward(
             network,
             self.parameters,
-            has_target=self._algorithm.record.target_network,
+            has_target=self.algorithm.record.target_network,
             is_mixed=is_mixed(spec.precision, self.parameters.values.device, network.convolutional),
         )
         # A recording saves what Python costs: much with small layers, little with convolutions.
@@ -90,7 +90,7 @@ class GradientComputer:
         # The statistics of observations do not change within a batch: prepare them once for all passes.
         batch = replace(batch, observations=self._network.prepare(batch.observations))
         bonus = torch.tensor(entropy_bonus, device=batch.valid.device)
-        for losses in self._algorithm.losses(batch, self.forward):
+        for losses in self.algorithm.losses(batch, self.forward):
             if not isinstance(losses, Losses | MinibatchLosses):
                 raise TypeError(f"losses() gives {type(losses).__name__}: it must yield Losses or MinibatchLosses")
             self._first_pass = losses.first_pass
@@ -140,7 +140,7 @@ class GradientComputer:
 
     def after_update(self, policy_version: int) -> None:
         """Let the algorithm do what follows an update, whose gradient the caller has applied."""
-        self._algorithm.after_update(policy_version, self.forward)
+        self.algorithm.after_update(policy_version, self.forward)
 
     def _try_after_update(self) -> None:
         before = {name: values.clone() for name, values in self.statistics.items()}
@@ -151,13 +151,13 @@ class GradientComputer:
     @property
     def own_statistics(self) -> dict[str, Tensor]:
         """Tensors that the algorithm itself changes after an update, by name; not those of the target network."""
-        return {f"algorithm/{name}": values for name, values in self._algorithm.statistics.items()}
+        return {f"algorithm/{name}": values for name, values in self.algorithm.statistics.items()}
 
     @property
     def statistics(self) -> dict[str, Tensor]:
         """Tensors of the algorithm that a checkpoint saves, by name, and restores in place."""
         statistics = self.own_statistics
-        if self._algorithm.record.target_network:
+        if self.algorithm.record.target_network:
             statistics["target_network"] = self.forward.target_values
         return statistics
 

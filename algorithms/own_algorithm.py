@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from daedalus.algorithms import action_values, policy_gradient
+from daedalus.algorithms import action_values, policy_gradient, sac
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.policy.network.action_distribution import ActionDistribution
@@ -88,7 +88,7 @@ def _fault(name: str, error: Exception) -> AlgorithmError:
 def _built_in() -> Iterator[tuple[str, type[Algorithm]]]:
     """Yield the classes of the built-in algorithms, each by the name of its record."""
     names = {id(record): name for name, record in ALGORITHMS.items()}
-    for module in (policy_gradient, action_values):
+    for module in (policy_gradient, action_values, sac):
         for kind in vars(module).values():
             if isinstance(kind, type) and (name := names.get(id(vars(kind).get("record")))):
                 yield name, kind

@@ -221,7 +221,7 @@ class FinalEpisodes:
         best, backend = [find_policy(directory)], spec.evaluation.final_backend or spec.environment.backend
         ((evaluation, report),) = self.play(best, backend, _FINAL_SEEDS, spec.evaluation.actions)
         confirmed = summary.get("confirmation") is not None  # by sampled episodes
-        can_differ = spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
+        can_differ = spec.algorithm.heads != "action_values"  # whose policy is always greedy
         true_task, trained = spec.trains_true_task, summary.get("episode_return_mean")
         if not true_task and trained is not None:
             evaluation["notes"].append(other_task_note(trained))

@@ -123,7 +123,7 @@ def _fit_one_environment(settings: dict[str, Any], algorithm: str) -> None:
     """Change default settings, in place, so that the batches of one environment are as large as those of several."""
     collection, record = settings["collection"], ALGORITHMS.get(algorithm)
     rollouts = (record and record.batch_rollouts) or collection["actors"]
-    if record is None or not record.synchronous:
+    if record is None or not (record.synchronous or record.replay):
         settings["training"]["batch_rollouts"] = rollouts * collection["envs_per_actor"]
     collection |= {"actors": 1, "envs_per_actor": 1}
 

@@ -92,8 +92,8 @@ def train(
         returns one, or an instance. What no module has, such as a class of a notebook, a lambda or an instance, is
         played by forks of this process, on Linux: each plays a copy of its own, and `resume` and `evaluate` need it
         again. An instance is played by one actor.
-      algorithm: "a2c", "a3c", "impala", "appo", "one_step_q", "one_step_sarsa" or "n_step_q", or "module:Class" for
-        your own.
+      algorithm: "a2c", "a3c", "impala", "appo", "one_step_q", "one_step_sarsa", "n_step_q" or "sac", or
+        "module:Class" for your own.
       actors: number of actor processes.
       seed: seed of the network, the environments and the actions.
       env_steps: budget, the environment steps of all actors together.

@@ -106,6 +106,7 @@ class LearnerService:
             if league is not None:
                 league.open(self._context.start_version)
             from daedalus.learner.training.learner import Learner
+            from daedalus.learner.training.replay_learner import ReplayLearner
 
             if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):
                 return self._stopped_without_actors()
@@ -115,7 +116,10 @@ class LearnerService:
             check_rollout_length(spec, spaces)
             if league is not None:
                 league.check_opponents(spaces)
-            learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
+            if spec.algorithm.replay:
+                learner: Learner = ReplayLearner(spec, spaces, self._beginning.modules)
+            else:
+                learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
             self._beginning.load_into(learner, spec, self._context.progress)
             checkpointer, loop = self._training_of(learner)
             if self._beginning.initial is not None:
@@ -148,12 +152,23 @@ class LearnerService:
         from daedalus.learner.training_loop import TrainingLoop
 
         program = learner.program()
-        checkpointer = Checkpointer(self._context, learner, program)
+        checkpointer = Checkpointer(self._context, learner, program, *self._replay_saves(learner))
         loop = TrainingLoop(
             self._context, self._server, learner, checkpointer, self._confirmation, self._heartbeat.beat
         )
         loop.publish(program)
         return checkpointer, loop
+
+    def _replay_saves(self, learner: "Learner") -> "tuple[Callable[[], Callable[[], None]], ...]":
+        """Load the replay buffer of a resumed run, and return what saves it; empty where there is nothing to save."""
+        from daedalus.learner.training.replay_files import ReplayFiles
+        from daedalus.learner.training.replay_learner import ReplayLearner
+
+        if not (isinstance(learner, ReplayLearner) and self._context.spec.training.replay_saved):
+            return ()
+        files = ReplayFiles(self._context.directory, learner)
+        files.load()
+        return (files.begin,)
 
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer", loop: "TrainingLoop") -> Outcome:
         """Train, then write the last metrics row, checkpoint and summary, and let the actors leave."""

@@ -105,6 +105,7 @@ class TrainingLoop:
     def publish(self, program: bytes) -> None:
         """Offer the policy to the actors, before the first update."""
         learner = self._learner
+        self._server.rollouts.updates_of = learner.updates_of
         self._server.offer_policy(program, learner.state_size, learner.gradient_shapes)
         if self._context.spec.uploads_gradients:
             self._server.publisher.extras = lambda: learner.gradient_inputs(self._context.progress)
@@ -156,17 +157,19 @@ class TrainingLoop:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
         learner, rollouts = self._learner, self._server.rollouts
         env_steps, progress = self._counters.env_steps, self._context.progress
-        batch = rollouts.take_batch(learner.policy_version)
+        version, goes_on = learner.policy_version, learner.updates_due > 0
+        batch = [] if goes_on else rollouts.take_batch(version)
         if self._context.league is not None:  # before the update: the first version is the policy of the beginning
             self._context.league.advance(learner, env_steps, self._checkpointer.add)
         self._health.left_out = rollouts.left_out
-        if not batch:
+        if not (batch or goes_on):
             return
         began = time.monotonic()
         skipped = learner.updates_skipped
         left_out = self._learn_from(batch, progress)
         learner.anneal_exploration(self._context.spec.training.exploration_annealing(progress, env_steps))
-        self._server.publisher.publish_if_due(learner.policy_version, learner.weights, len(batch))
+        if learner.policy_version > version:  # a replay buffer that fills makes no update
+            self._server.publisher.publish_if_due(learner.policy_version, learner.weights, max(len(batch), 1))
         rollouts.count_trained(batch, left_out, learner.far_outside)
         now = time.monotonic()
         if learner.far_outside:

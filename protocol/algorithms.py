@@ -13,7 +13,7 @@ from pydantic import Field
 
 from daedalus.protocol.models import PositiveInt, Specification, UnitInterval
 
-Heads = Literal["policy_and_value", "action_values"]
+Heads = Literal["policy_and_value", "action_values", "policy"]
 Epsilons = Annotated[tuple[UnitInterval, ...], Field(min_length=1, max_length=64)]
 
 
@@ -44,7 +44,11 @@ class AlgorithmRecord(ActorDemands):
     max_lag_batches: PositiveInt = 32
     """The largest policy lag where the run does not say, in batches."""
     heads: Heads = "policy_and_value"
-    """`action_values`: the head computes Q(s, a) of each choice, and the policy is greedy; there is no value head."""
+    """`action_values`: the head computes Q(s, a) of each choice, and the policy is greedy; there is no value head.
+    `policy`: there is no value head; critics stay in the learner."""
+    replay: bool = False
+    """Rollouts go into a replay buffer, however old their policy is; minibatches of its transitions make the updates,
+    in a fixed ratio to the env_steps."""
     target_network: bool = False
     """The learner keeps a second network, which `Algorithm.after_update` sets and which gradients do not change."""
     epsilons: Epsilons = (0.0,)
@@ -79,6 +83,12 @@ ALGORITHMS = {
     "one_step_q": _of_action_values("Q-learning with one-step targets"),
     "one_step_sarsa": _of_action_values("as one_step_q, on the action that was taken next", next_action=True),
     "n_step_q": _of_action_values("Q-learning with n-step targets"),
+    "sac": AlgorithmRecord(
+        summary="soft actor-critic: learns from each step many times, for slow environments",
+        batch_rollouts=1,
+        heads="policy",
+        replay=True,
+    ),
 }
 _OWN = re.compile(r"\w+(\.\w+)*:\w+")  # module:Class
 

@@ -36,6 +36,7 @@ _Part = TypeVar("_Part", bound=Specification)
 _MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcome, and the names of the settings
 
 
+_ANY_LAG = 2**62  # more updates than any run makes
 _PAST_SHARE = 0.2  # of the matches, if it is not set
 _WITH_PARAMETERS = ("gymnasium", "fast")  # backends
 FROM_PYTHON = "python:"  # beginning of the id of an environment that only the program has which started the run
@@ -232,8 +233,8 @@ class LossSpec(Specification):
 
     algorithm: Annotated[str, Field(max_length=200), AfterValidator(check_algorithm)] = "impala"
     """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: PPO, asynchronous, in several passes;
-    `one_step_q`, `one_step_sarsa` and `n_step_q`: action values, for one discrete action. Or `module:Class` for your
-    own."""
+    `one_step_q`, `one_step_sarsa` and `n_step_q`: action values, for one discrete action; `sac`: from a replay buffer,
+    for bounded continuous actions. Or `module:Class` for your own."""
     algorithm_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """Further arguments of the constructor of an algorithm of your own."""
     algorithm_record: AlgorithmRecord | None = None
@@ -339,10 +340,29 @@ class TrainingSpec(LossSpec):
     max_policy_lag: NaturalInt | None = None
     """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 8 batches for `a3c` and the
     methods of action values, of 32 for the others; of more where the live actors can have more than half as many in
-    flight."""
+    flight. No limit for `sac`."""
     exploration_env_steps: NaturalInt | None = None
     """Env_steps of all actors together in which epsilon falls linearly from 1 to the number that the actor drew; 0: it
     has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
+    replay_transitions: PositiveInt = 1_000_000
+    """Newest transitions that the replay buffer keeps, at most as many as `env_steps`; `sac` only, as are the next
+    seven settings."""
+    replay_megabytes: Annotated[float, Field(gt=0.0)] | None = None
+    """MiB of memory that the replay buffer may need: one that needs more is refused. Unset: three quarters of the
+    memory that is available when the learner starts."""
+    replay_saved: bool = True
+    """Save the replay buffer in the run directory, with each checkpoint. A resumed run otherwise begins with an empty
+    one."""
+    replay_begin: NaturalInt = 1000
+    """Transitions in the replay buffer before updates begin; at most half of its capacity."""
+    updates_per_env_step: Annotated[float, Field(gt=0.0, le=64.0)] = 1.0
+    """Updates for each env_step that is received. Actors wait for a learner that falls behind."""
+    minibatch_rows: Annotated[int, Field(ge=1, le=65_536)] = 256
+    """Transitions that each update learns from, drawn uniformly from the replay buffer."""
+    n_step: Annotated[int, Field(ge=1, le=64)] = 1
+    """Rewards in the target of a transition before it bootstraps; fewer at the end of an episode or a rollout."""
+    target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
+    """Share of the way that the target critics move to the critics at each update."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
 
@@ -617,6 +637,40 @@ class RunSpec(Specification):
         return self
 
     @model_validator(mode="after")
+    def _replay_fits_the_policy(self) -> "RunSpec":
+        if not self.algorithm.replay:
+            return self
+        name, policy = self.training.algorithm, self.policy
+        if is_own(name):
+            raise ValueError(f"training.algorithm={name}: replay is for sac alone: leave it out of the record")
+        if self.uploads_gradients:
+            raise ValueError(
+                f"collection.upload is gradients, but {name} learns from a replay buffer, which only the learner has: "
+                "set collection.upload=rollouts"
+            )
+        if policy.memory != "none":
+            raise ValueError(
+                f"policy.memory is {policy.memory}, but {name} learns from single transitions: set policy.memory=none, "
+                "and environment.frame_stack if one observation does not tell enough, or use appo"
+            )
+        if (policy.distribution, policy.state_dependent_std) != ("squashed_gaussian", True):
+            raise ValueError(
+                f"{name} needs policy.distribution=squashed_gaussian and policy.state_dependent_std=true, as they are "
+                f"where the algorithm is chosen with --algorithm {name}"
+            )
+        if self.training.normalize_rewards:
+            raise ValueError(
+                f"training.normalize_rewards is true, but {name} keeps rewards for many updates, which need one scale: "
+                "set it to false, and environment.reward_scale if rewards are very large or small"
+            )
+        if self.training.curiosity:
+            raise ValueError(
+                f"training.curiosity is for algorithms that learn from new rollouts, but {name} keeps rewards in a "
+                "replay buffer, where they would not fade: set training.curiosity=0"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _curiosity_sees_rollouts(self) -> "RunSpec":
         if self.uploads_gradients and self.training.curiosity:
             raise ValueError(
@@ -764,6 +818,8 @@ class RunSpec(Specification):
         training = self.training
         if training.max_policy_lag is not None:
             return training.max_policy_lag
+        if self.algorithm.replay:
+            return _ANY_LAG
         actors = max(self.collection.actors, live)
         in_flight = math.ceil(actors * self.collection.window / self.batch_rollouts)  # batches
         return max(self.algorithm.max_lag_batches, 2 * in_flight) * training.updates_per_batch

@@ -9,6 +9,7 @@ from daedalus.protocol.spec import RunSpec
 _SLOW_SECONDS = 0.005  # a step of a few milliseconds costs more than the exchange with another process
 _WIDE = 1e6  # from bound to bound of an action: the policy explores a hundredth of it to the end
 _SMALL_PIXEL = 16  # an image without a larger value is rather a map of numbers, such as the kinds of things in a grid
+_DEAR_SECONDS = 0.02  # a step of so long costs more than several updates of a small network
 _BUSY = 0.2  # share of processor time below which a step mostly waits, even on a busy machine
 
 
@@ -53,6 +54,7 @@ def advice(report: EnvironmentReport, spec: RunSpec, processors: int) -> list[st
         stacked_images(report, spec),
         small_bytes(report, spec),
         uninformative_bounds(report),
+        replay_instead(report, spec),
     )
     return [text for text in texts if text]
 
@@ -171,6 +173,18 @@ def uninformative_bounds(report: EnvironmentReport) -> str:
                     "where useful values are closer together, give it their bounds"
                 )
     return ""
+
+
+def replay_instead(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice to learn from each step many times, where steps are slow and sac can learn, or an empty string."""
+    actions = report.spaces.actions.values() if report.spaces is not None else ()
+    fits = bool(actions) and all(isinstance(space, ContinuousSpace) and space.bounded for space in actions)
+    if report.step_seconds <= _DEAR_SECONDS or not fits or spec.algorithm.replay or spec.environment.is_game:
+        return ""
+    return (
+        f"a step takes {_duration(report.step_seconds)}: training.algorithm=sac (--algorithm sac) learns from each "
+        f"step many times, and so needs far fewer of them than {spec.training.algorithm}"
+    )
 
 
 def never_ends(report: EnvironmentReport, spec: RunSpec) -> str:

@@ -126,8 +126,8 @@ class Policy:
           action_masks: N masks, as for `act`.
 
         Raises ValueError as `act` does, for a policy that remembers earlier observations (a memory, stacked or pooled
-        frames), for one of action values, which has no probabilities, and if the network cannot be built, such as for
-        a module of the user that is not allowed.
+        frames), for one of action values or of sac, which lacks probabilities or values, and if the network cannot be
+        built, such as for a module of the user that is not allowed.
         """
         spaces, count = self._transforms.spaces, len(observations)
         stacked = any(isinstance(each, ArraySpace) and each.frames > 1 for each in spaces.observations.values())
@@ -145,7 +145,9 @@ class Policy:
         running.observe(Observed(frames, legal))
         outputs = self._estimator().outputs(running.observations, legal)
         if outputs is None:
-            raise ValueError("this policy takes the best of its action values and has no probabilities: call act()")
+            raise ValueError(
+                "this policy has no probabilities or no values (it is of action values, or of sac): call act()"
+            )
         size = self._runtime.noise_size
         choice = running.act(draw_noise(size, count, self._random) if sampled else neutral_noise(size, count))
         return Decisions(

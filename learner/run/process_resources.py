@@ -1,4 +1,4 @@
-"""What a learner process sets up with the operating system: reserved file descriptors, and an allocator that is fast.
+"""What a learner process sets up with the operating system, or asks it: descriptors, an allocator, free memory.
 
 Connections of peers use up all file descriptors that are not reserved for the files of the run. A connection is
 accepted by the network's own threads, before anybody knows whose it is. So the limit of this process stays below what
@@ -10,6 +10,7 @@ import ctypes
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 _LARGEST_SHARE = 8  # part of all descriptors, at most
 
@@ -74,3 +75,22 @@ def keep_freed_memory() -> None:
         return
     mallopt(_M_MMAP_THRESHOLD, 1 << 30)
     mallopt(_M_TRIM_THRESHOLD, _NEVER)
+
+
+_CONTROL_GROUP = Path("/sys/fs/cgroup")  # that of this process, as a container sees it
+
+
+def available_memory() -> int | None:
+    """Return the bytes of memory that this process can still take, or None where the system does not say."""
+    found = []
+    try:
+        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
+        found += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable:")]
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        limit, used = ((_CONTROL_GROUP / name).read_text("ascii") for name in ("memory.max", "memory.current"))
+        found.append(max(int(limit) - int(used), 0))  # the limit may be "max"
+    except (OSError, ValueError):
+        pass
+    return min(found, default=None)

@@ -30,6 +30,7 @@ _TABLES = {
     for name, field in getattr(sections.annotation, "model_fields", {}).items()
     if field.annotation == dict[str, JsonValue]
 }
+_REPLAY = "sac"  # learns otherwise than all others, which share the settings of a preset
 _NONE = "none"  # {none = true} stands for None in a table of arguments: TOML has no null value
 _WORDS = {"true": "true", "yes": "true", "on": "true", "false": "false", "no": "false", "off": "false"} | dict.fromkeys(
     ("none", "null", "nil"), _NONE
@@ -189,14 +190,20 @@ def assign(settings: dict[str, Any], path: str, value: Any) -> None:
 def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
     """Set the algorithm, unless it is None, and apply the preset's `[for_algorithm.NAME]` settings for it.
 
+    sac, where the preset is of another algorithm and has none for it, gets the settings in defaults/sac.toml.
+
     Raises SettingsError if `for_algorithm` is not a table of sections, or names an unknown algorithm or setting, also
     for another algorithm.
     """
     training = settings.setdefault("training", {})
+    before = training.get("algorithm")
     if algorithm is not None:
         training["algorithm"] = algorithm
     tables = settings.pop("for_algorithm", {})
     _check_for_algorithm(tables)
+    if algorithm == _REPLAY and before != _REPLAY and _REPLAY not in tables:
+        file = importlib.resources.files("daedalus.learner.run.defaults") / f"{_REPLAY}.toml"
+        tables = {_REPLAY: tomllib.loads(file.read_text("utf-8"))}
     chosen = training.get("algorithm", TrainingSpec.model_fields["algorithm"].default)
     for section, values in (tables.get(chosen, {}) if isinstance(chosen, str) else {}).items():
         for key, value in values.items():

@@ -169,6 +169,8 @@ class RolloutIntake:
         self._fleet, self._counters, self._events = context.fleet, context.counters, context.events
         self._version = context.start_version  # rollouts of this version have a policy lag of 0
         self._league, self._lessons = context.league, context.lessons
+        # Number of updates of a batch. A learner with a replay buffer sets its own.
+        self.updates_of: Callable[[Sequence[Upload]], int] = self._updates_of
         self._judge = RolloutJudge(context.spec, context.learner_epoch, context.fleet, context.league)
         self._buffer = _buffer(context.spec, self._judge)
         self._requests = RequestQueue(context.spec.service.queue_bytes, _most_requests(context.spec, live=0))
@@ -324,13 +326,16 @@ class RolloutIntake:
                 actors[rollout.identity.actor].rejected["stale"] += 1
         if not taken.rollouts:
             return
-        updates = updates_of(self._spec.training, taken.rollouts, memory=self._judge.state_size > 0)
+        updates = self.updates_of(taken.rollouts)
         self._counters.trained(taken.rollouts, version, updates)
         self._lessons.add(taken.rollouts, self._counters.env_steps)
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
                 actors[rollout.identity.actor].env_steps += rollout.env_steps
         self._version = version + updates
+
+    def _updates_of(self, uploads: Sequence[Upload]) -> int:
+        return updates_of(self._spec.training, uploads, memory=self._judge.state_size > 0)
 
     # --------------------------------------------------------------------------------------- the intake thread
 
@@ -453,6 +458,8 @@ def _most_requests(spec: RunSpec, live: int) -> int:
     Further rollouts are answered busy: in the queue they would become stale.
     """
     batches = spec.policy_lag_bound_with(live) // spec.training.updates_per_batch + 1
+    if spec.algorithm.replay:  # in which no rollout becomes stale
+        batches = spec.algorithm.max_lag_batches
     return max(batches * spec.batch_rollouts, 2 * max(spec.collection.actors, live))
 
 

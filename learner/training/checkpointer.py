@@ -51,14 +51,22 @@ class Saving:
 class Checkpointer:
     """Writer of one learner's checkpoints into its run directory."""
 
-    def __init__(self, context: RunContext, learner: Learner, program: bytes) -> None:
+    def __init__(
+        self,
+        context: RunContext,
+        learner: Learner,
+        program: bytes,
+        begin_replay: Callable[[], Callable[[], None]] = lambda: lambda: None,
+    ) -> None:
         """Construct the checkpointer, and start its thread.
 
         Args:
           context: the counters and settings to save. Checkpoints that are being evaluated are not pruned.
           learner: source of the parameters and the optimiser state.
           program: content of every checkpoint.
+          begin_replay: copies what is to be saved of a replay buffer, and returns what writes it: ReplayFiles.begin.
         """
+        self._begin_replay = begin_replay
         self._context, self._spec, self._health, self._events = context, context.spec, context.health, context.events
         self._learner, self._program = learner, program
         self.seconds = 0.0  # that the last checkpoint took to be written
@@ -102,13 +110,15 @@ class Checkpointer:
             counters=counters,
             score=score,
         )
+        # Not with the policies of evaluators, which wait.
+        write_replay = self._begin_replay() if again else lambda: None
         # Evaluations that end meanwhile are in it too, and none begins before the thread is idle.
         in_use = self._context.evaluations.checkpoints_in_use
 
         def save() -> None:
             try:
                 if again or self._newest != (saving.policy_version, directory) or not directory.exists():
-                    self._save(saving, encoded, in_use)
+                    self._save(saving, encoded, in_use, write_replay)
                 else:
                     saving.is_saved = True
             finally:
@@ -195,15 +205,19 @@ class Checkpointer:
             with self._counting:
                 self._unfinished -= 1
 
-    def _save(self, saving: Saving, encoded: EncodedCheckpoint, in_use: Set[Path]) -> None:
-        began, keep = time.monotonic(), self._spec.service.keep_checkpoints
+    def _save(
+        self, saving: Saving, encoded: EncodedCheckpoint, in_use: Set[Path], write_replay: Callable[[], None]
+    ) -> None:
+        began, keep, what = time.monotonic(), self._spec.service.keep_checkpoints, "checkpoint"
         try:
             if self._newest is not None and not (self._context.directory / CONFIG).exists():
                 self._restore_config()
             save_checkpoint(self._context.directory, encoded, keep=keep, also_keep=in_use)
+            what = "replay buffer"
+            write_replay()
         except OSError as error:
             fault = error.strerror or type(error).__name__
-            saving.result = f"checkpoint not saved: {fault}"
+            saving.result = f"{what} not saved: {fault}"
             if not self._health.save_fault and not saving.last:
                 text = (
                     f"{saving.result}; the previous checkpoint is kept, training continues, "

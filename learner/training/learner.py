@@ -190,6 +190,15 @@ class Learner:
         """S, the size of the recurrent state of the policy; 0 without memory."""
         return self._network.state_size
 
+    @property
+    def updates_due(self) -> int:
+        """Number of updates that `step` has left to make, without rollouts: none, but for a replay buffer."""
+        return 0
+
+    def updates_of(self, rollouts: Sequence[Upload]) -> int:
+        """Return the number of updates, and of new versions, that a batch of these uploads makes."""
+        return updates_of(self._spec, rollouts, memory=self.state_size > 0)
+
     def step(self, rollouts: Sequence[Rollout], progress: float) -> list[Rollout]:
         """Make all updates of one batch. Return the rollouts that were left out of updates.
 
@@ -201,7 +210,7 @@ class Learner:
           rollouts: the rollouts of the batch, in order.
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
-        end = self.policy_version + updates_of(self._spec, rollouts, memory=self.state_size > 0)
+        end = self.policy_version + self.updates_of(rollouts)
         if self._curiosity is not None:
             self._curiosity.look(rollouts, _annealed(self._spec.curiosity, 0.0, progress))
         batch, kept, seen = self._sorted_out(rollouts)

@@ -7,6 +7,7 @@ from daedalus.policy.network.distributions import (
     Categorical,
     Distribution,
     Greedy,
+    SquashedGaussian,
     continuous_distribution,
     without_illegal,
 )
@@ -36,6 +37,8 @@ class ActionDistribution(nn.Module):
         if training is not None and training.record.heads == "action_values":
             distributions: list[Distribution] = [Greedy(_only_choice(spaces, training.algorithm))]
         else:
+            if training is not None and training.record.replay:
+                _check_bounded(spaces, training.algorithm)
             distributions = [_distribution(spec, name, space, modules) for name, space in spaces.actions.items()]
         self.components = nn.ModuleList(distributions)
         self._sizes = [component.parameter_count for component in self._distributions()]
@@ -58,6 +61,21 @@ class ActionDistribution(nn.Module):
         normals = normal.split([component.normal_count for component in self._distributions()], -1)
         parts = zip(self._parts(parameters, masks), uniforms, normals, strict=True)
         return {name: part.sample(own, u, n) for (name, part, own), u, n in parts}
+
+    def sample_and_log_prob(self, parameters: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return reparameterised samples of squashed Gaussians, side by side [B, D], and their log-density [B].
+
+        Args:
+          parameters: [B, P].
+          normal: [B, D], standard normal.
+        """
+        noise = normal.split([component.normal_count for component in self._distributions()], -1)
+        samples = [
+            part.sample_and_log_prob(own, own_noise)
+            for (_, part, own), own_noise in zip(self._parts(parameters, {}), noise, strict=True)
+            if isinstance(part, SquashedGaussian)
+        ]
+        return torch.cat([actions for actions, _ in samples], -1), _sum([log_prob for _, log_prob in samples])
 
     def log_prob(self, parameters: Tensor, actions: Components, masks: Components) -> Tensor:
         """Return log pi(a | s): parameters [..., P], actions [..., D], masks [..., choices] -> [...], in nats."""
@@ -106,6 +124,15 @@ def _only_choice(spaces: Spaces, algorithm: str) -> DiscreteSpace:
         f"training.algorithm={algorithm} learns the value of each choice of one discrete action, but this environment "
         f"has {spaces.listed_actions}: use a2c, a3c, impala or appo{table if len(spaces.actions) == 1 else ''}"
     )
+
+
+def _check_bounded(spaces: Spaces, algorithm: str) -> None:
+    """Raise NetworkError, which names the algorithm, unless all actions are continuous and have both bounds."""
+    if not all(isinstance(space, ContinuousSpace) and space.bounded for space in spaces.actions.values()):
+        raise NetworkError(
+            f"training.algorithm={algorithm} needs continuous actions with bounds on both sides, but this environment "
+            f"has {spaces.listed_actions}: use appo, or let a wrapper (--wrap) bound the actions"
+        )
 
 
 def _distribution(

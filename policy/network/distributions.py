@@ -240,13 +240,22 @@ class SquashedGaussian(Gaussian):
         above, below = (1.0 + actions).log(), (1.0 - actions).log()
         return super().log_prob(parameters, 0.5 * (above - below)) - (above + below).sum(-1)
 
+    def sample_and_log_prob(self, parameters: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `sample` [..., D] and its log-density [...], both with the gradients of reparameterised samples.
+
+        The density is computed from u = mu + sigma * normal: u = artanh(a) would lose digits near the bounds.
+        """
+        mean, log_std = self._mean_and_log_std(parameters)
+        u = mean + log_std.exp() * normal
+        log_densities = -0.5 * normal.square() - log_std - _log_slope(u)
+        return u.tanh(), log_densities.sum(-1) - _HALF_LOG_2_PI * self._size
+
     def entropy(self, parameters: Tensor) -> Tensor:
         """See Distribution: H(u) + sum_d E[log(1 - tanh^2 u_d)], the expectation by Gauss-Hermite quadrature."""
         mean, log_std = self._mean_and_log_std(parameters)
         nodes, weights = (part.to(mean.device) for part in expectation(_GAUSSIAN_POINTS))
         u = mean.unsqueeze(-1) + log_std.exp().unsqueeze(-1) * nodes  # [..., D, Q]
-        log_slopes = 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))  # log(1 - tanh^2 u), without overflow
-        return super().entropy(parameters) + (log_slopes * weights).sum(-1).sum(-1)
+        return super().entropy(parameters) + (_log_slope(u) * weights).sum(-1).sum(-1)
 
     def log_prob_and_entropy(self, parameters: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """See Distribution."""
@@ -258,6 +267,11 @@ class SquashedGaussian(Gaussian):
         beyond = mean - inner
         # Not by tanh, whose gradient vanishes: a mean that is far beyond must come back.
         return inner + beyond / (1.0 + beyond.abs() / (_LARGEST_MEAN - _FREE_MEAN)), log_std
+
+
+def _log_slope(u: Tensor) -> Tensor:
+    """Return log(1 - tanh^2 u), without overflow."""
+    return 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
 
 
 def _gaussian_log_density(mean: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ from daedalus.actor.checking.play import check_environment, unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
 from daedalus.actor.environments.precision import Precision
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 FAULTY = "faulty_environments:Faulty-v0"
@@ -298,6 +298,24 @@ def spec(**collection: object) -> RunSpec:
     return run_spec().model_copy(
         update={"collection": run_spec().collection.model_copy(update={"envs_per_actor": 16, **collection})}
     )
+
+
+def test_slow_continuous_steps_suggest_sac() -> None:
+    arm, choice = ContinuousSpace(low=(-1.0,), high=(1.0,)), DiscreteSpace(counts=(2,))
+    free = ContinuousSpace(low=(None,), high=(None,))
+
+    def proposes(action: ContinuousSpace | DiscreteSpace, seconds: float, **training: Any) -> bool:
+        spaces = Spaces(observations={"o": ArraySpace(shape=(3,), dtype="float32")}, actions={"a": action})
+        policy = {"distribution": "squashed_gaussian", "state_dependent_std": True}
+        run = RunSpec.model_validate({"environment": {"id": "Any-v0"}, "policy": policy, "training": training})
+        found = advice(EnvironmentReport(spaces=spaces, step_seconds=seconds), run, processors=2)
+        return any("training.algorithm=sac" in text for text in found)
+
+    assert proposes(arm, 0.021)
+    assert not proposes(arm, 0.019)
+    assert not proposes(arm, 0.021, algorithm="sac")
+    assert not proposes(choice, 0.021)
+    assert not proposes(free, 0.021)
 
 
 def test_slow_steps_suggest_processes_where_they_help() -> None:

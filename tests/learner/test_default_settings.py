@@ -57,7 +57,7 @@ def test_default_settings_are_valid_for_each_algorithm(where: Spaces | None, alg
     settings.pop("with_memory")
     choose_algorithm(settings, algorithm)
     spec = run_spec(settings)
-    assert spec.training.normalize_rewards
+    assert spec.training.normalize_rewards or spec.algorithm.replay
     assert spec.training.target_return is None
 
 

@@ -315,7 +315,7 @@ def test_value_out_of_range_error_names_the_range(assignment: str, range_: str) 
         ("environment.reward_scale=inf", "setting environment.reward_scale "),
         ("service.queue_megabytes=inf", "setting service.queue_megabytes "),
         ("training.learning_rate=fast", "setting training.learning_rate should be"),
-        ("training.algorithm=ppo", "one_step_sarsa, n_step_q (did you mean appo?), not 'ppo'"),
+        ("training.algorithm=ppo", "one_step_sarsa, n_step_q, sac (did you mean appo?), not 'ppo'"),
         ("policy.hidden=64", "setting policy.hidden is 64, which is not a list: write policy.hidden=[64]"),
         # Without the quotes that a shell removed.
         ("environment.leave_out=mission", "not a list: write --set \"environment.leave_out=['mission']\""),
@@ -386,6 +386,16 @@ def test_for_algorithm_settings_apply_only_to_the_chosen_algorithm() -> None:
         spec = run_spec(settings)
         assert (spec.training.batch_rollouts, spec.collection.actors) == (batch, actors)
         assert spec.training.algorithm == (algorithm or "impala")
+
+
+def test_sac_replaces_the_settings_of_another_algorithm_and_keeps_its_own() -> None:
+    settings = read_preset("hopper")
+    choose_algorithm(settings, "sac")
+    assert run_spec(settings).policy.distribution == "squashed_gaussian"
+    assert settings["environment"]["id"] == "Hopper-v5"
+    settings["policy"]["hidden"] = [32]  # such as in the config.toml of a run
+    choose_algorithm(settings, "sac")
+    assert settings["policy"]["hidden"] == [32]
 
 
 @pytest.mark.parametrize("table", [3, {"impala": 3}, {"impala": {"training": 3}}])

@@ -1,0 +1,185 @@
+"""Replay buffer: the newest transitions of all rollouts, for an algorithm that learns from each more than once.
+
+State in main memory; no I/O, no threads.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from daedalus.policy.network.layers import Components
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
+from daedalus.protocol.uploads import Rollout
+
+_OTHER_BYTES = 24  # of a row: its reward, flags, age, and index among the rows to learn from, rounded up
+
+
+class Transitions(NamedTuple):
+    """B transitions, from the observation of a row to the one that its target bootstraps from."""
+
+    observations: Components  # each [B, *stacked_shape]; discrete ones int64
+    next_observations: Components  # the same
+    actions: Tensor  # [B, D] float32, all components side by side
+    rewards: Tensor  # [B], the sum of the discounted rewards up to the next observation
+    discounts: Tensor  # [B], of the value of the next observation; 0 after a termination
+
+
+class ReplayBuffer:
+    """The newest columns of rollouts: T rows of one environment each, with the T+1 observations around them.
+
+    A frame is stored once for its column, and stacked when it is sampled. The oldest column makes room for a new one,
+    with all its rows. A transition does not go beyond its column: its target bootstraps at the last row at the latest.
+    Neither does it go beyond the end of an episode, nor beyond a row before one that is overridden, whose action is not
+    the policy's: the target bootstraps there. Reset rows and overridden rows are never sampled.
+    """
+
+    def __init__(self, spaces: Spaces, rollout_length: int, capacity: int) -> None:
+        """Allocate an empty buffer. The system gives the memory when it is first written to.
+
+        Args:
+          spaces: components of observations and actions; the actions are continuous.
+          rollout_length: T, rows of a column.
+          capacity: rows, rounded up to columns.
+        """
+        self._rows, self.columns = rollout_length, -(-capacity // rollout_length)
+        self._depths = {name: space.frames for name, space in spaces.observations.items()}
+        self._discrete = {name for name, space in spaces.observations.items() if isinstance(space, DiscreteSpace)}
+        self._action_names = tuple(spaces.actions)
+        cells = (self.columns, rollout_length)
+        self._arrays = {  # what a column is made of, by name; the first axis is that of the columns
+            **{
+                f"frames/{name}": np.zeros((self.columns, space.frames + rollout_length, *space.shape), space.dtype)
+                for name, space in spaces.observations.items()
+            },
+            "actions": np.zeros((*cells, sum(space.size for space in spaces.actions.values())), np.float32),
+            "rewards": np.zeros(cells, np.float32),
+            "terminated": np.zeros(cells, np.bool_),
+            "ends": np.zeros(cells, np.bool_),  # the target of the row bootstraps from the next observation
+            "learned": np.zeros(cells, np.bool_),
+            # Of each observation: how many frames before it are of its episode, at most those in a stack.
+            "ages": np.zeros((self.columns, rollout_length + 1), np.uint8),
+        }
+        self._most_frames = max(self._depths.values())
+        self._indices = np.arange(self.columns * rollout_length).reshape(cells)
+        # The rows to learn from, oldest first: columns come and go in order, and with them their rows.
+        self._queue = np.zeros(self.columns * rollout_length, np.int64)
+        self._first = self._last = 0  # of the queue, counted over all rows that ever were in it
+        self._counts = np.zeros(self.columns, np.int64)  # rows to learn from in each column
+        self.columns_added = 0  # ever
+
+    @staticmethod
+    def bytes_of_column(spaces: Spaces, rollout_length: int) -> int:
+        """Return the memory that a column takes, in bytes."""
+        frames = sum(
+            (space.frames + rollout_length) * math.prod(space.shape) * np.dtype(space.dtype).itemsize
+            for space in spaces.observations.values()
+        )
+        actions = 4 * sum(space.size for space in spaces.actions.values())
+        return frames + rollout_length * (actions + _OTHER_BYTES)
+
+    @property
+    def capacity(self) -> int:
+        """Rows of all columns together."""
+        return self.columns * self._rows
+
+    def __len__(self) -> int:
+        """Return the number of transitions that can be sampled."""
+        return self._last - self._first
+
+    def add(self, rollout: Rollout) -> None:
+        """Add all columns of a rollout, or its last ones if it has more than the buffer."""
+        ends = rollout.terminated | rollout.truncated  # [T, E]
+        ends[:-1] |= ~rollout.learned[1:]
+        rows = {
+            **{f"frames/{name}": frames for name, frames in rollout.frames.items()},
+            "actions": np.concatenate([rollout.actions[name] for name in self._action_names], -1),
+            "rewards": rollout.rewards,
+            "terminated": rollout.terminated,
+            "ends": ends,
+            "learned": rollout.learned,
+            "ages": self._ages_of(rollout.valid),
+        }
+        self.add_columns({name: values.swapaxes(0, 1) for name, values in rows.items()})
+
+    def _ages_of(self, valid: np.ndarray) -> np.ndarray:
+        """Return the ages [T+1, E] of the observations. The frames before row 0 are its complete stack."""
+        ages = np.full((self._rows + 1, valid.shape[1]), self._most_frames - 1, np.uint8)
+        for row in range(self._rows if self._most_frames > 1 else 0):
+            ages[row + 1] = np.where(valid[row], np.minimum(ages[row] + 1, self._most_frames - 1), 0)
+        return ages
+
+    def add_columns(self, arrays: dict[str, np.ndarray]) -> None:
+        """Add columns, or the last ones if they are more than the buffer has: each array [columns, ...] of `copied`."""
+        arrays = {name: values[-self.columns :] for name, values in arrays.items()}
+        learned = arrays["learned"]
+        at = (self.columns_added + np.arange(len(learned))) % self.columns
+        self._first += int(self._counts[at].sum())
+        for name, values in arrays.items():
+            self._arrays[name][at] = values
+        self._counts[at] = learned.sum(1)
+        new = self._indices[at][learned]
+        self._queue[(self._last + np.arange(len(new))) % len(self._queue)] = new
+        self._last += len(new)
+        self.columns_added += len(learned)
+
+    def copied(self, first: int, last: int) -> dict[str, np.ndarray]:
+        """Return copies of the columns `first` to `last` - 1, counted over all that ever were added; each is held."""
+        at = np.arange(first, last) % self.columns
+        return {name: values[at] for name, values in self._arrays.items()}
+
+    def shapes(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+        """Return shape and data type of each array of one column, by name."""
+        return {name: (values.shape[1:], values.dtype) for name, values in self._arrays.items()}
+
+    def sample(self, count: int, n_step: int, discount_factor: float) -> Transitions:
+        """Return transitions of rows drawn uniformly, with torch's random numbers; the buffer is not empty.
+
+        The target of row t has m rewards, at most `n_step`:
+
+            rewards = sum_{i < m} discount_factor^i r_{t+i},  discounts = discount_factor^m (1 - terminated_{t+m-1})
+        """
+        drawn = torch.randint(len(self), (count,)).numpy()
+        return self.transitions(self._queue[(self._first + drawn) % len(self._queue)], n_step, discount_factor)
+
+    def transitions(self, indices: np.ndarray, n_step: int, discount_factor: float) -> Transitions:
+        """Return the transitions of some rows, [B] indices of those in `learned_rows`; for the rest see `sample`."""
+        columns, rows = np.divmod(indices, self._rows)
+        flat = {name: self._arrays[name].ravel() for name in ("rewards", "terminated", "ends")}
+        rewards, discounts = np.zeros(len(rows), np.float32), np.ones(len(rows), np.float32)
+        following, goes_on = rows.copy(), np.ones(len(rows), np.bool_)
+        for _ in range(n_step):
+            at = columns * self._rows + np.minimum(following, self._rows - 1)
+            rewards += np.where(goes_on, discounts * flat["rewards"][at], 0.0)
+            discounts *= np.where(goes_on, np.where(flat["terminated"][at], 0.0, discount_factor), 1.0)
+            following += goes_on
+            goes_on &= ~flat["ends"][at] & (following < self._rows)
+        return Transitions(
+            observations=self._observations(columns, rows),
+            next_observations=self._observations(columns, following),
+            actions=torch.from_numpy(self._arrays["actions"][columns, rows]),
+            rewards=torch.from_numpy(rewards),
+            discounts=torch.from_numpy(discounts),
+        )
+
+    @property
+    def learned_rows(self) -> np.ndarray:
+        """Indices of all rows that can be sampled, oldest first."""
+        return self._queue[np.arange(self._first, self._last) % len(self._queue)]
+
+    def _observations(self, columns: np.ndarray, rows: np.ndarray) -> Components:
+        """Return the observations of rows, with their stacks."""
+        found: Components = {}
+        for name, depth in self._depths.items():
+            frames = self._arrays[f"frames/{name}"]
+            newest = rows + (depth - 1)
+            if depth == 1:
+                values = frames[columns, newest]
+            else:
+                # The first frame of an episode replaces those before it: see protocol/frames.py.
+                back = np.minimum(np.arange(depth - 1, -1, -1), self._arrays["ages"][columns, rows][:, None])  # [B, k]
+                values = frames[columns[:, None], newest[:, None] - back]
+            found[name] = torch.from_numpy(values.astype(np.int64) if name in self._discrete else values)
+        return found

@@ -1,0 +1,165 @@
+"""Soft actor-critic: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", algorithm 1.
+
+The critics stay in the learner: the program and the snapshots of the actors are the policy alone.
+"""
+
+import copy
+import itertools
+import math
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor, nn
+
+from daedalus.algorithms.algorithm import Algorithm, Forward
+from daedalus.algorithms.forward import FlatParameters
+from daedalus.algorithms.recording import OperationRecorder
+from daedalus.algorithms.replay_buffer import Transitions
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.encoders import build_encoder
+from daedalus.policy.network.layers import Components
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.algorithms import ALGORITHMS
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import PolicySpec
+
+
+class TwinCritics(nn.Module):
+    """Two critics Q_1(s, a) and Q_2(s, a) with layers of their own, computed at once, and one encoder of images."""
+
+    def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules) -> None:
+        """Construct both. The layers have the sizes of `policy.hidden`; see `build_encoder` for the exceptions."""
+        super().__init__()
+        # Without layers of its own, an encoder of vectors puts all components side by side.
+        self.encoder = build_encoder(spec.model_copy(update={"hidden": ()}), spaces.observations, modules)
+        actions = sum(space.size for space in spaces.actions.values())
+        sizes = [self.encoder.features + actions, *spec.hidden, 1]
+        pairs = list(itertools.pairwise(sizes))
+        # As torch initialises linear layers; [2, inputs, outputs] and [2, 1, outputs].
+        self.weights = nn.ParameterList([_uniform(inputs, (2, inputs, outputs)) for inputs, outputs in pairs])
+        self.biases = nn.ParameterList([_uniform(inputs, (2, 1, outputs)) for inputs, outputs in pairs])
+        self._activate = torch.relu if spec.activation == "relu" else torch.tanh
+
+    def forward(self, normalized: Components, actions: Tensor) -> Tensor:
+        """Return both values [2, B] of actions [B, D] in observations, each [B, *stacked_shape]."""
+        features = torch.cat([self.encoder(normalized).float(), actions], -1)
+        hidden = features.expand(2, *features.shape)
+        *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        for inner_weight, inner_bias in layers:
+            hidden = self._activate(torch.baddbmm(inner_bias, hidden, inner_weight))
+        device = hidden.device.type
+        # In full precision, as the heads of ActorCritic.
+        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
+            return torch.baddbmm(bias, hidden.float(), weight).squeeze(-1)
+
+
+def _uniform(inputs: int, shape: tuple[int, ...]) -> nn.Parameter:
+    bound = 1.0 / math.sqrt(inputs)
+    return nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+
+
+class Sac(Algorithm):
+    """Twin critics with target critics, a squashed Gaussian policy, and a temperature alpha that keeps its entropy.
+
+    With a' ~ pi(s') and a transition of m rewards R and discounts d (replay_buffer.py), both critics regress on
+
+        y = R + d (min_i Q-_i(s', a') - alpha log pi(a' | s'))
+
+    the policy descends E[alpha log pi(a | s) - min_i Q_i(s, a)], a ~ pi(s), and log alpha descends
+    -log alpha (log pi(a | s) + H), with the entropy H = -D of the actions scaled to [-1, 1] as the target. All three
+    gradients are those at the parameters before the update.
+    """
+
+    record = ALGORITHMS["sac"]
+
+    def build(
+        self, critics: TwinCritics, network: ActorCritic, learned: FlatParameters, *, target_rate: float, is_mixed: bool
+    ) -> None:
+        """Begin with these critics, and a temperature of 1, before the first update.
+
+        Args:
+          critics: on the device of the network.
+          network: the policy.
+          learned: its parameters that have gradients.
+          target_rate: share of the way that the target critics move to the critics at each update.
+          is_mixed: whether forward passes compute in bfloat16.
+        """
+        device = learned.values.device
+        self._network, self._learned, self._critics = network, learned, critics
+        self._target_critics = copy.deepcopy(self._critics).requires_grad_(False)
+        self._flat = FlatParameters(self._critics.parameters())
+        self._targets = FlatParameters(self._target_critics.parameters()).values
+        self._log_temperature = torch.zeros(1, device=device)
+        self._actions = self.distribution.normal_count  # D
+        self._target_rate, self._is_mixed = target_rate, is_mixed
+        self._recorder = OperationRecorder()
+        self._records = device.type == "cpu" and not network.convolutional and not network.has_user_modules
+        # What optimisers change, besides the policy.
+        self.learned = {"critics": self._flat.values, "log_temperature": self._log_temperature}
+        self.statistics = {**self.learned, "target_critics": self._targets}
+
+    @property
+    def temperature(self) -> float:
+        """Alpha, the weight of the entropy of the policy."""
+        return math.exp(float(self._log_temperature))
+
+    def gradients(self, transitions: Transitions) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """Return the gradients of one update, by the names in `learned` and "policy", and its loss terms (Terms)."""
+        names = tuple(transitions.observations)
+        rows = len(transitions.rewards)
+        noise = torch.randn((2 * rows, self._actions), device=transitions.rewards.device)
+        tensors = [
+            *transitions.observations.values(),
+            *transitions.next_observations.values(),
+            *transitions[2:],
+            noise,
+        ]
+
+        def computed(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+            size = len(names)
+            now = dict(zip(names, tensors[:size], strict=True))
+            then = dict(zip(names, tensors[size : 2 * size], strict=True))
+            return self._gradients(now, then, *tensors[2 * size :])
+
+        results = self._recorder.call(names, computed, tensors) if self._records else computed(tensors)
+        policy, critics, temperature, *terms = results
+        return {"policy": policy, "critics": critics, "log_temperature": temperature}, terms
+
+    def _gradients(
+        self, now: Components, then: Components, actions: Tensor, rewards: Tensor, discounts: Tensor, noise: Tensor
+    ) -> tuple[Tensor, ...]:
+        rows, temperature = len(rewards), self._log_temperature.exp()
+        now, then = self._network.normalizer(now), self._network.normalizer(then)
+        with self._precision():
+            with torch.no_grad():
+                next_actions, next_log_probs = self._choose(then, noise[rows:])
+                next_values = self._target_critics(then, next_actions).amin(0) - temperature * next_log_probs
+                targets = rewards + discounts * next_values
+            values = self._critics(now, actions)  # [2, B]
+            value_loss = 0.5 * (values - targets).square().mean(-1).sum()
+            critic_gradient = self._flat.differentiated(value_loss)
+            chosen, log_probs = self._choose(now, noise[:rows])
+            first, second = self._critics(now, chosen).unbind()
+            policy_loss = (temperature * log_probs - torch.minimum(first, second)).mean()
+            policy_gradient = self._learned.differentiated(policy_loss)
+        entropy = -log_probs.detach().mean()
+        temperature_gradient = (entropy + self._actions).reshape(1)
+        terms = (policy_loss.detach(), value_loss.detach(), entropy, entropy.new_zeros(()))
+        return policy_gradient, critic_gradient, temperature_gradient, *terms
+
+    def _choose(self, normalized: Components, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Return actions of the policy [B, D] and their log-densities [B], made from noise [B, D]."""
+        features = self._network.encoder(normalized).float()
+        device = features.device.type
+        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
+            parameters = self._network.policy_head(features)
+            return self.distribution.sample_and_log_prob(parameters, noise)
+
+    def _precision(self) -> AbstractContextManager[object]:
+        device = self._log_temperature.device.type
+        return torch.autocast(device, torch.bfloat16) if self._is_mixed else nullcontext()
+
+    def after_update(self, policy_version: int, forward: Forward) -> None:
+        """See Algorithm: move the target critics by `target_rate` of the way to the critics."""
+        self._targets.lerp_(self._flat.values, self._target_rate)

@@ -1,0 +1,158 @@
+"""The learner of an algorithm with a replay buffer: rollouts go into it, and minibatches of it make the updates."""
+
+import math
+import secrets
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from daedalus.algorithms.gradients import Terms, is_mixed
+from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions
+from daedalus.algorithms.sac import Sac, TwinCritics
+from daedalus.learner.run.process_resources import available_memory
+from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.training.learner import Learner
+from daedalus.learner.training.optimizers import build_optimizer
+from daedalus.policy.network.layers import map_components
+from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout, Upload
+
+_SLICE_SECONDS = 0.5  # of updates at a time: evaluators, orders and signals wait meanwhile
+_MEMORY_SHARE = 0.75  # of what is available, where the run does not say
+
+
+class ReplayLearner(Learner):
+    """Learner with a replay buffer.
+
+    Each row to learn from earns `training.updates_per_env_step` updates, of which the whole ones are made after its
+    rollout, before the next rollout is taken: actors that are faster wait, and slower ones are waited for.
+    """
+
+    def __init__(self, run: RunSpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
+        """Construct the learner at policy version 0. Raises as Learner, and SettingsError for too large a buffer."""
+        spec = run.training
+        self.replay = build_replay_buffer(spec, spaces, run.collection.rollout_length)
+        super().__init__(spec, run.policy, spaces, modules)
+        algorithm = self._gradients.algorithm
+        assert isinstance(algorithm, Sac)
+        mixed = is_mixed(spec.precision, self.device, self._network.convolutional)
+        critics = TwinCritics(run.policy, spaces, modules).to(self.device)
+        algorithm.build(critics, self._network, self._flat, target_rate=spec.target_rate, is_mixed=mixed)
+        self._algorithm = algorithm
+        self._learned = {"policy": self._flat.values, **algorithm.learned}
+        self._optimizers = {
+            "policy": self._optimizer,
+            **{name: build_optimizer(spec, values) for name, values in algorithm.learned.items()},
+        }
+        self._begin = max(min(spec.replay_begin, self.replay.capacity // 2), 1)
+        self._owed = torch.zeros((), dtype=torch.float64)  # updates that rows have earned, and that are not made yet
+        # Of the run: its buffer on the disk has the same.
+        self._identity = torch.tensor(secrets.randbits(62))
+
+    @property
+    def replay_identity(self) -> int:
+        """Random number of the run, which its saved replay buffer bears."""
+        return int(self._identity)
+
+    def updates_of(self, rollouts: Sequence[Upload]) -> int:
+        """Return the number of updates that the learner makes after it has received these rollouts."""
+        steps = sum(rollout.agent_steps for rollout in rollouts)
+        if len(self.replay) + steps < self._begin:
+            return 0
+        return math.floor(float(self._owed) + self._spec.updates_per_env_step * steps)
+
+    @property
+    def updates_due(self) -> int:
+        """Number of updates to make before the next rollout is taken."""
+        return self.updates_of(())
+
+    def step(self, rollouts: Sequence[Rollout], progress: float) -> list[Rollout]:
+        """Add rollouts to the buffer, and make the updates that are due, for half a second at most.
+
+        While `updates_due` is not 0, the caller calls again, without rollouts. See Learner.
+        """
+        self.far_outside = {}
+        if rollouts:
+            steps = sum(rollout.agent_steps for rollout in rollouts)
+            if len(self.replay) + steps >= self._begin:
+                self._owed += self._spec.updates_per_env_step * steps
+            self._receive(rollouts)
+        end = time.monotonic() + _SLICE_SECONDS
+        while self.updates_due and time.monotonic() < end:
+            self._owed -= 1.0
+            self._update(progress)
+        return []
+
+    def _receive(self, rollouts: Sequence[Rollout]) -> None:
+        batch, kept, seen = self._sorted_out(rollouts)
+        for rollout in kept:
+            share = np.float32(self._reward_shares[rollout])
+            self.replay.add(replace(rollout, rewards=rollout.rewards * share) if share < 1.0 else rollout)
+        self._merge_observations([seen[rollout] for rollout in kept])
+        self.metrics.add_batch(batch)
+
+    def _update(self, progress: float) -> None:
+        """Make one update, or skip it if a gradient is not finite."""
+        spec = self._spec
+        transitions = self.replay.sample(spec.minibatch_rows, spec.n_step, spec.discount_factor)
+        gradients, terms = self._algorithm.gradients(_moved(transitions, self.device))
+        norms = {name: float(torch.linalg.vector_norm(gradient)) for name, gradient in gradients.items()}
+        self.policy_version += 1
+        if not all(map(math.isfinite, norms.values())):
+            self.updates_skipped += 1
+            return
+        for name, gradient in gradients.items():
+            if norms[name] > spec.max_gradient_norm:
+                gradient = gradient * (spec.max_gradient_norm / norms[name])
+            self._optimizers[name].step(self._learned[name], gradient, self.learning_rate(progress))
+        self._gradients.after_update(self.policy_version)
+        clipped = max(norms.values()) > spec.max_gradient_norm
+        self.metrics.add_update(Terms(*terms), math.hypot(*norms.values()), clipped=clipped)
+
+    def entropy_bonus(self, progress: float) -> float:
+        """Return the weight of the entropy: the temperature, which is learned."""
+        return self._algorithm.temperature
+
+    def _statistics(self) -> dict[str, Tensor]:
+        statistics = super()._statistics() | {"replay/owed": self._owed, "replay/identity": self._identity}
+        for name in self._algorithm.learned:
+            for part, values in self._optimizers[name].statistics.items():
+                statistics[f"{self._spec.optimizer}/{name}/{part}"] = values
+        return statistics
+
+
+def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int) -> ReplayBuffer:
+    """Return an empty buffer. Raises SettingsError, with how many transitions would fit, if it is too large."""
+    capacity = min(spec.replay_transitions, spec.env_steps)
+    column = ReplayBuffer.bytes_of_column(spaces, rollout_length)
+    columns = -(-capacity // rollout_length)
+    if spec.replay_megabytes is not None:
+        most, whose = int(spec.replay_megabytes * 2**20), "training.replay_megabytes allows"
+    else:
+        most, whose = available_memory(), "three quarters of the available memory are"
+        most = None if most is None else int(_MEMORY_SHARE * most)
+    if most is not None and columns * column > most:
+        fitting = most // column * rollout_length
+        remedy = f"set training.replay_transitions={fitting} or fewer" if fitting else "use smaller observations"
+        raise SettingsError(
+            f"a replay buffer of {capacity:,} transitions takes {columns * column / 2**20:,.0f} MiB, and {whose} "
+            f"{most / 2**20:,.0f} MiB: {fitting:,} transitions fit; {remedy}"
+        )
+    return ReplayBuffer(spaces, rollout_length, capacity)
+
+
+def _moved(transitions: Transitions, device: torch.device) -> Transitions:
+    if device.type == "cpu":
+        return transitions
+
+    def moved(values: Tensor) -> Tensor:
+        return values.to(device)
+
+    observations, following, *others = transitions
+    return Transitions(map_components(observations, moved), map_components(following, moved), *map(moved, others))

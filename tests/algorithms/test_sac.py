@@ -1,0 +1,204 @@
+"""algorithms/sac.py against a slow oracle in plain torch, a case by hand, and torch.distributions."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch import distributions as reference
+
+from daedalus.algorithms.forward import FlatParameters
+from daedalus.algorithms.gradients import GradientComputer
+from daedalus.algorithms.recording import EARLIER_CALLS
+from daedalus.algorithms.replay_buffer import Transitions
+from daedalus.algorithms.sac import Sac, TwinCritics
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.distributions import SquashedGaussian
+from daedalus.policy.user_modules import NO_MODULES, NetworkError
+from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
+
+ARM = ContinuousSpace(low=(-1.0, 0.0), high=(1.0, 2.0))
+LEG = ContinuousSpace(low=(-1.0,), high=(1.0,))
+POLICY = PolicySpec(hidden=(5, 4), activation="relu", distribution="squashed_gaussian", state_dependent_std=True)
+ROWS, NUMBERS = 6, 3
+
+
+def spaces_of(**actions: ActionSpace) -> Spaces:
+    return Spaces(observations={"o": ArraySpace(shape=(NUMBERS,), dtype="float32")}, actions=actions)
+
+
+SPACES = spaces_of(arm=ARM, leg=LEG)
+
+
+class Built:
+    """Sac, and the parts that the learner joins it with."""
+
+    def __init__(self, seed: int = 1, **training: Any) -> None:
+        torch.manual_seed(seed)
+        spec = TrainingSpec.model_validate({"algorithm": "sac", **training})
+        self.network = ActorCritic(POLICY, SPACES, training=spec)
+        self.network.policy_head.weight.data.normal_(std=0.3)
+        computer = GradientComputer(spec, self.network, SPACES)
+        assert isinstance(computer.algorithm, Sac)
+        self.sac, self.learned = computer.algorithm, computer.parameters
+        self.critics = TwinCritics(POLICY, SPACES, NO_MODULES)
+        self.sac.build(self.critics, self.network, self.learned, target_rate=spec.target_rate, is_mixed=False)
+        self.sac.statistics["target_critics"].add_(torch.randn_like(self.sac.statistics["target_critics"]) * 0.1)
+        self.sac.learned["log_temperature"].fill_(math.log(0.3))
+
+    @property
+    def targets(self) -> TwinCritics:
+        """The target critics."""
+        critics = TwinCritics(POLICY, SPACES, NO_MODULES)
+        values = FlatParameters(critics.parameters()).values
+        values.copy_(self.sac.statistics["target_critics"])
+        return critics
+
+
+def transitions(seed: int = 3) -> Transitions:
+    torch.manual_seed(seed)
+    return Transitions(
+        observations={"o": torch.randn(ROWS, NUMBERS)},
+        next_observations={"o": torch.randn(ROWS, NUMBERS)},
+        actions=torch.rand(ROWS, 3) * 2.0 - 1.0,
+        rewards=torch.randn(ROWS),
+        discounts=torch.tensor([0.9, 0.0] * (ROWS // 2)),
+    )
+
+
+def value(critics: TwinCritics, which: int, observation: Tensor, action: Tensor) -> Tensor:
+    """Q_which(s, a) of one observation and one action, layer by layer."""
+    inputs = torch.cat([observation, action])
+    layers = list(zip(critics.weights, critics.biases, strict=True))
+    for index, (weight, bias) in enumerate(layers):
+        inputs = inputs @ weight[which] + bias[which, 0]
+        if index < len(layers) - 1:
+            inputs = inputs.clamp(min=0.0)
+    return inputs[0]
+
+
+def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """a ~ pi(s) and log pi(a | s), by torch.distributions."""
+    parameters = network.policy_head(network.encoder({"o": observation[None]}))[0]
+    arm, leg = parameters.split([4, 2])
+    first, second = (part for part in network.distribution.components if isinstance(part, SquashedGaussian))
+    mean = torch.cat([arm[:2], leg[:1]])
+    assert mean.abs().max() < 4.0  # the means are as the head computes them
+    deviation = torch.cat([first.log_std + arm[2:], second.log_std + leg[1:]]).clamp(-5.0, 2.0).exp()
+    squashed = reference.TransformedDistribution(
+        reference.Normal(mean, deviation), reference.TanhTransform(cache_size=1)
+    )
+    action = torch.tanh(mean + deviation * noise)
+    return action, squashed.log_prob(action).sum()
+
+
+def test_gradients_are_those_of_the_papers_losses() -> None:
+    built, batch = Built(), transitions()
+    torch.manual_seed(5)
+    noise = torch.randn(2 * ROWS, 3)
+    torch.manual_seed(5)
+    gradients, terms = built.sac.gradients(batch)
+    alpha, targets = 0.3, built.targets
+    value_loss, policy_loss, entropy = torch.zeros(()), torch.zeros(()), torch.zeros(())
+    for row in range(ROWS):
+        now, then = batch.observations["o"][row], batch.next_observations["o"][row]
+        with torch.no_grad():
+            action, log_prob = chosen(built.network, then, noise[ROWS + row])
+            smaller = min(value(targets, which, then, action) for which in range(2))
+            y = batch.rewards[row] + batch.discounts[row] * (smaller - alpha * log_prob)
+        for which in range(2):
+            value_loss = value_loss + 0.5 * (value(built.critics, which, now, batch.actions[row]) - y) ** 2 / ROWS
+        action, log_prob = chosen(built.network, now, noise[row])
+        smaller = torch.minimum(value(built.critics, 0, now, action), value(built.critics, 1, now, action))
+        policy_loss = policy_loss + (alpha * log_prob - smaller) / ROWS
+        entropy = entropy - log_prob.detach() / ROWS
+    for name, loss, parameters in (
+        ("critics", value_loss, list(built.critics.parameters())),
+        ("policy", policy_loss, built.network.learned_parameters()),
+    ):
+        expected = torch.cat([each.flatten() for each in torch.autograd.grad(loss, parameters)])
+        torch.testing.assert_close(gradients[name], expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(gradients["log_temperature"], (entropy + 3.0).reshape(1), rtol=1e-4, atol=1e-5)
+    for found, loss in zip(terms, (policy_loss, value_loss, entropy), strict=False):
+        torch.testing.assert_close(found, loss.detach(), rtol=1e-4, atol=1e-5)
+
+
+def test_target_by_hand() -> None:
+    """Policy N(0, 1) before tanh, Q- = 2 and 5, Q = 1 and 4: y = r + d (2 - alpha log pi(a' | s'))."""
+    built = Built()
+    for parameter in built.network.parameters():
+        parameter.data.zero_()
+    for which, values in (
+        (built.sac.statistics["target_critics"], (2.0, 5.0)),
+        (built.sac.learned["critics"], (1.0, 4.0)),
+    ):
+        which.zero_()
+        which[-2:] = torch.tensor(values)  # the biases of the last layer
+    batch = transitions()._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
+    torch.manual_seed(5)
+    u = torch.randn(2 * ROWS, 3)[ROWS:].double()
+    torch.manual_seed(5)
+    _, (_, value_loss, *_) = built.sac.gradients(batch)
+    log_prob = (-0.5 * u**2 - 0.5 * math.log(2.0 * math.pi) - torch.log(1.0 - torch.tanh(u) ** 2)).sum(-1)
+    y = 0.5 + 0.9 * (2.0 - 0.3 * log_prob)
+    assert float(value_loss) == pytest.approx(float((0.5 * ((1.0 - y) ** 2 + (4.0 - y) ** 2)).mean()), rel=1e-4)
+
+
+def test_recorded_updates_have_the_gradients_of_the_others() -> None:
+    built = Built()
+    for _ in range(EARLIER_CALLS + 1):
+        built.sac.gradients(transitions(8))
+    batch = transitions(8)
+    torch.manual_seed(7)
+    found, _ = built.sac.gradients(batch)
+    other = Built()
+    torch.manual_seed(7)
+    expected, _ = other.sac.gradients(batch)
+    for name, gradient in found.items():
+        torch.testing.assert_close(gradient, expected[name])
+
+
+def test_target_critics_follow_the_critics() -> None:
+    built = Built(target_rate=0.25)
+    before, critics = built.sac.statistics["target_critics"].clone(), built.sac.statistics["critics"]
+    built.sac.after_update(1, GradientComputer(built.sac.spec, built.network, SPACES).forward)
+    torch.testing.assert_close(built.sac.statistics["target_critics"], 0.75 * before + 0.25 * critics)
+
+
+@pytest.mark.parametrize("mean", [0.0, 1.5, -3.9])
+def test_sampled_density_is_that_of_torch_also_beyond_the_last_digit(mean: float) -> None:
+    family = SquashedGaussian(LEG, initial_std=1.0, state_dependent=True).double().requires_grad_(False)
+    noise = torch.linspace(-6.0, 6.0, 25, dtype=torch.float64)[:, None]
+    parameters = torch.tensor([mean, math.log(0.7)], dtype=torch.float64).expand(25, 2)
+    actions, log_probs = family.sample_and_log_prob(parameters, noise)
+    u = mean + 0.7 * noise
+    normal = reference.Normal(torch.tensor(mean, dtype=torch.float64), 0.7)
+    expected = normal.log_prob(u) - reference.TanhTransform().log_abs_det_jacobian(u, u.tanh())
+    torch.testing.assert_close(log_probs, expected.sum(-1))
+    torch.testing.assert_close(actions, u.tanh())
+
+
+@pytest.mark.parametrize(
+    ("actions", "named"),
+    [
+        ({"a": DiscreteSpace(counts=(4,))}, "4 choices"),
+        ({"arm": ARM, "hand": DiscreteSpace(counts=(2,))}, "hand"),
+        ({"a": ContinuousSpace(low=(None,), high=(1.0,))}, "-inf"),
+    ],
+)
+def test_other_actions_are_refused_in_one_line(actions: dict[str, ActionSpace], named: str) -> None:
+    with pytest.raises(NetworkError, match=r"^training\.algorithm=sac needs continuous actions with bounds") as refusal:
+        ActorCritic(POLICY, spaces_of(**actions), training=TrainingSpec(algorithm="sac"))
+    assert named in str(refusal.value)
+    assert "use appo" in str(refusal.value)
+
+
+def test_images_have_an_encoder_of_the_critics() -> None:
+    pixels = ArraySpace(shape=(20, 20), dtype="uint8", frames=2)
+    spaces = Spaces(observations={"pixels": pixels}, actions={"leg": LEG})
+    critics = TwinCritics(POLICY, spaces, NO_MODULES)
+    assert any(isinstance(module, nn.Conv2d) for module in critics.modules())
+    images = torch.randint(0, 255, (4, 2, 20, 20), dtype=torch.uint8)
+    assert critics({"pixels": images}, torch.zeros(4, 1)).shape == (2, 4)

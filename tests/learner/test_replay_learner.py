@@ -1,0 +1,200 @@
+"""The learner with a replay buffer: how many updates, resume, and the buffer on the disk."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from building import identity, make_rollout
+
+from daedalus.learner.run.resuming import CheckpointMismatchError
+from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.training.replay_files import FOLDER, ReplayFiles
+from daedalus.learner.training.replay_learner import ReplayLearner
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout
+
+SPACES = Spaces(
+    observations={"observation": ArraySpace(shape=(3,), dtype="float32")},
+    actions={"action": ContinuousSpace(low=(-1.0,), high=(1.0,))},
+)
+POLICY = {"hidden": (6,), "distribution": "squashed_gaussian", "state_dependent_std": True}
+ROWS, ENVIRONMENTS = 4, 2
+
+
+def spec_of(sections: dict[str, Any] | None = None, **training: Any) -> RunSpec:
+    content: dict[str, Any] = {
+        "environment": {"id": "Any-v0"},
+        "policy": POLICY,
+        "collection": {"rollout_length": ROWS, "actors": 1, "envs_per_actor": ENVIRONMENTS},
+        "training": {"algorithm": "sac", "replay_begin": 16, "minibatch_rows": 8, **training},
+    }
+    for section, values in (sections or {}).items():
+        content[section] = content[section] | values
+    return RunSpec.model_validate(content)
+
+
+def rollout(seed: int, rows: int = ROWS) -> Rollout:
+    """Return a rollout in which all rows are learned from."""
+    random, cells = np.random.default_rng(seed), (rows, ENVIRONMENTS)
+    none = np.zeros(cells, np.bool_)
+    actions = {"action": random.uniform(-1.0, 1.0, (*cells, 1)).astype(np.float32)}
+    flags: dict[str, Any] = {"terminated": none, "truncated": none.copy(), "valid": ~none, "actions": actions}
+    empty = {"episode_returns": np.zeros(0, np.float32), "episode_lengths": np.zeros(0, np.int32)}
+    return make_rollout(identity(sequence=seed), rows=rows, environments=ENVIRONMENTS, seed=seed, **flags, **empty)
+
+
+def trained(learner: ReplayLearner, *seeds: int) -> ReplayLearner:
+    for seed in seeds:
+        learner.step([rollout(seed)], 0.0)
+        while learner.updates_due:
+            learner.step([], 0.0)
+    return learner
+
+
+def test_each_row_earns_its_updates_after_the_beginning() -> None:
+    learner = ReplayLearner(spec_of(updates_per_env_step=0.3125), SPACES)
+    versions, planned = [], []
+    for seed in range(6):
+        planned.append(learner.updates_of([rollout(seed)]))
+        versions.append(trained(learner, seed).policy_version)
+    # 8 rows a rollout: none for the first 8; then 2.5 for each rollout, of which whole ones are made.
+    assert versions == [0, 2, 5, 7, 10, 12]
+    assert planned == np.diff([0, *versions]).tolist()
+
+
+def test_updates_change_policy_critics_and_temperature() -> None:
+    learner = trained(ReplayLearner(spec_of(), SPACES), 0)
+    before = {name: values.copy() for name, values in learner.weights().items()}
+    state = {name: values.clone() for name, values in learner.state().items()}
+    trained(learner, 1, 2)
+    assert learner.policy_version == 16
+    assert any((learner.weights()[name] != values).any() for name, values in before.items())
+    for name in ("critics", "target_critics", "log_temperature"):
+        assert (learner.state()[f"algorithm/{name}"] != state[f"algorithm/{name}"]).any(), name
+    assert learner.entropy_bonus(0.0) != 1.0
+    assert learner.metrics.take_means()["gradient_norm"] > 0.0
+
+
+def test_a_rollout_that_is_not_finite_for_the_critics_is_survived() -> None:
+    learner = trained(ReplayLearner(spec_of(max_gradient_norm=0.5), SPACES), 0, 1)
+    wild = rollout(2)
+    wild.rewards[:] = 1e9  # the largest that the judge lets through
+    learner.step([wild], 0.0)
+    trained(learner, 3, 4, 5)
+    assert all(np.isfinite(values).all() for values in learner.weights().values())
+    assert all(torch.isfinite(values.float()).all() for values in learner.state().values())
+
+
+def saved(learner: ReplayLearner, directory: Path, files: ReplayFiles | None = None) -> ReplayFiles:
+    files = files or ReplayFiles(directory, learner)
+    files.begin()()
+    return files
+
+
+def resumed(learner: ReplayLearner, directory: Path, spec: RunSpec) -> tuple[ReplayLearner, ReplayFiles]:
+    other = ReplayLearner(spec, SPACES)
+    other.restore(learner.policy_version, learner.weights(), {k: v.clone() for k, v in learner.state().items()})
+    files = ReplayFiles(directory, other)
+    files.load()
+    return other, files
+
+
+def contents(learner: ReplayLearner) -> list[list[float]]:
+    found = learner.replay.transitions(learner.replay.learned_rows, 1, 0.9)
+    return [each.tolist() for each in (found.rewards, found.actions, found.next_observations["observation"])]
+
+
+def test_resumed_learner_continues_exactly(tmp_path: Path) -> None:
+    spec = spec_of(replay_transitions=40)
+    learner = trained(ReplayLearner(spec, SPACES), *range(3))
+    files = saved(learner, tmp_path)
+    trained(learner, *range(3, 8))  # the buffer has dropped the first ones
+    saved(learner, tmp_path, files)
+    other, _ = resumed(learner, tmp_path, spec)
+    assert contents(other) == contents(learner)
+    torch.manual_seed(9)
+    trained(learner, 20, 21)
+    torch.manual_seed(9)
+    trained(other, 20, 21)
+    assert other.policy_version == learner.policy_version
+    # The columns have other places in the memory of the buffer, but the same order.
+    for name, values in learner.weights().items():
+        np.testing.assert_array_equal(other.weights()[name], values)
+
+
+def test_saved_parts_are_no_more_than_the_buffer_and_one(tmp_path: Path) -> None:
+    spec = spec_of(replay_transitions=40)  # 10 columns, of which a rollout adds 2
+    learner = ReplayLearner(spec, SPACES)
+    files = ReplayFiles(tmp_path, learner)
+    for seed in range(20):
+        learner.step([rollout(seed)], 0.0)
+        saved(learner, tmp_path, files)
+    names = sorted(path.name for path in (tmp_path / FOLDER).iterdir())
+    assert names[0].startswith("000000000030-")
+    assert len(names) == 5
+    other, files = resumed(learner, tmp_path, spec)
+    assert contents(other) == contents(learner)
+    other.step([rollout(30)], 0.0)
+    saved(other, tmp_path, files)  # goes on after the newest
+    assert max(path.name for path in (tmp_path / FOLDER).iterdir()) == "000000000040-000000000042"
+
+
+def test_a_damaged_part_is_left_out_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    spec = spec_of()
+    learner = trained(ReplayLearner(spec, SPACES), 0)
+    files = saved(learner, tmp_path)
+    trained(learner, 1)
+    saved(learner, tmp_path, files)
+    first, _ = sorted((tmp_path / FOLDER).iterdir())
+    data = bytearray((first / "columns.safetensors").read_bytes())
+    data[-1] ^= 1
+    (first / "columns.safetensors").write_bytes(data)
+    other, _ = resumed(learner, tmp_path, spec)
+    assert len(other.replay) == 8
+    assert "a part of the replay buffer is left out" in caplog.text
+
+
+def test_the_buffer_of_another_run_or_of_other_rollouts_is_refused(tmp_path: Path) -> None:
+    spec = spec_of()
+    learner, stranger = (trained(ReplayLearner(spec, SPACES), 0) for _ in range(2))
+    saved(stranger, tmp_path)
+    with pytest.raises(CheckpointMismatchError, match=r"of another run: remove the folder .*replay"):
+        resumed(learner, tmp_path, spec)
+    shutil.rmtree(tmp_path / FOLDER)
+    saved(learner, tmp_path)
+    longer = spec_of({"collection": {"rollout_length": 8}})
+    with pytest.raises(CheckpointMismatchError, match=r"restore collection\.rollout_length"):
+        resumed(learner, tmp_path, longer)
+
+
+def test_a_buffer_that_does_not_fit_is_refused_with_what_would() -> None:
+    with pytest.raises(
+        SettingsError, match=r"1,000,000 transitions takes .* MiB, .*: ([\d,]+) transitions fit"
+    ) as refusal:
+        ReplayLearner(spec_of(replay_megabytes=4.0), SPACES)
+    fitting = int(str(refusal.value).split("replay_transitions=")[1].split()[0])
+    ReplayLearner(spec_of(replay_megabytes=4.0, replay_transitions=fitting), SPACES)
+    with pytest.raises(SettingsError, match="fit"):
+        ReplayLearner(spec_of(replay_megabytes=4.0, replay_transitions=fitting + ROWS), SPACES)
+
+
+@pytest.mark.parametrize(
+    ("sections", "training", "remedy"),
+    [
+        ({"collection": {"upload": "gradients"}}, {}, "set collection.upload=rollouts"),
+        ({"policy": {"memory": "gru"}}, {}, "set policy.memory=none"),
+        ({"policy": {"distribution": "gaussian"}}, {}, "policy.distribution=squashed_gaussian"),
+        ({}, {"normalize_rewards": True}, "environment.reward_scale"),
+        ({}, {"curiosity": 0.5}, "training.curiosity=0"),
+    ],
+)
+def test_settings_that_replay_cannot_keep_are_refused(
+    sections: dict[str, Any], training: dict[str, Any], remedy: str
+) -> None:
+    with pytest.raises(ValueError, match="sac") as refusal:
+        spec_of(sections, **training)
+    assert remedy in str(refusal.value)
