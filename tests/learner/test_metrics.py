@@ -200,7 +200,7 @@ def test_the_files_of_a_month_are_bounded_and_lose_nothing_in_aggregate(
 
 
 def test_what_crashes_while_old_rows_are_merged_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thinning, "MAX_BYTES", 4000)
+    monkeypatch.setattr(thinning, "MAX_BYTES", 5000)
     path, rows = tmp_path / "metrics.csv", [{"env_steps": step, "user/score": 1.5} for step in range(1000, 1150)]
 
     def full(*_: object) -> None:
