@@ -16,7 +16,9 @@ from daedalus.protocol.uploads import Rollout
 
 METRICS = ("first_visit_fraction", "curiosity_reward_mean")
 _MOST_OBSERVATIONS = 2_000_000  # of all running episodes together, about 200 MB
+_SIZE = 8  # of the set of an episode itself, in observations
 _JUDGED_ROWS = 4096  # the first ones
+_LARGEST = 10.0  # reward at a weight of 1, as that of normalised rewards
 _MOST_NEW = 0.95  # share of first visits, above which observations do not come back
 
 _logger = logging.getLogger(__name__)
@@ -54,7 +56,7 @@ class FirstVisits:
                 elif code not in known:
                     first[row, environment] = 1.0
                 known.add(code)
-        self._streams.put(rollout, seen, size=sum(map(len, seen)))
+        self._streams.put(rollout, seen, size=sum(map(len, seen)) + _SIZE * len(seen))
         if self._streams.has_forgotten and not self._has_warned:
             self._has_warned = True
             _logger.warning(
@@ -79,7 +81,7 @@ def _codes(rollout: Rollout) -> list[list[int]]:
 class Curiosity:
     """Rewards for first visits, which the learner adds to those of the environment.
 
-        b_t = w / d if s_{t+1} is new in its episode, else 0
+        b_t = w min(1 / d, 10) if s_{t+1} is new in its episode, else 0
 
     with a weight w, and d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for
     the rewards of the environment (RewardNormalizer). Where each episode has another map, this term alone explores as
@@ -92,7 +94,7 @@ class Curiosity:
         self._visits = FirstVisits(synchronous=synchronous)
         self._scale = RewardNormalizer(discount_factor, synchronous=synchronous)
         self._newest: dict[Rollout, np.ndarray] = {}  # first visits of the newest batch
-        self._factor = 0.0  # w / d
+        self._factor = 0.0  # of the newest batch
         self._rows = self._new = 0  # among the first rows; it has judged them if there are enough
 
     @property
@@ -105,7 +107,7 @@ class Curiosity:
         self._newest = {each: self._visits.add(each) for each in rollouts}
         counted = [replace(each, rewards=first) for each, first in self._newest.items()]
         self._scale.moments.merge(self._scale.moments_of(counted))
-        self._factor = weight / self._scale.divisor
+        self._factor = weight * min(1.0 / self._scale.divisor, _LARGEST)
         if self._rows < _JUDGED_ROWS:
             self._judge()
 

@@ -367,10 +367,12 @@ def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None
             spec.environment.id,
         )
     leave_out = [*spec.environment.leave_out, *report.constant_texts]
-    for name, codes in report.codes.items():
+    # An encoder for images that the user has chosen takes no codes.
+    found = report.codes if spec.policy.encoder in ("auto", "mlp", "grid") else {}
+    for name, codes in found.items():
         shown = ",".join(map(str, codes))
-        _logger.info("observation component %r is read as codes (policy.codes.%s=[%s])", name, name, shown)
-    return report.spaces, default_settings(report.spaces, leave_out, report.seats, report.codes)
+        _logger.info("observation component %r has codes: by default policy.codes.%s=[%s]", name, name, shown)
+    return report.spaces, default_settings(report.spaces, leave_out, report.seats, found)
 
 
 def quick_check(

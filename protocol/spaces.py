@@ -50,7 +50,7 @@ def unfit_code(values: np.ndarray, codes: Sequence[int]) -> str:
     place = unknown[0]
     return (
         f"has the value {largest[place]} in place {place} of its last axis, but policy.codes has {codes[place]} codes "
-        "there: correct the environment, or start a run with higher numbers in policy.codes"
+        "there: correct the environment, or start a run with higher numbers in policy.codes, or policy.codes=none"
     )
 
 

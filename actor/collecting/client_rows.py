@@ -269,7 +269,7 @@ def check_run(spec: ActorSpec) -> None:
 
 def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
     """Raise ActorError for settings about stepping and wrapping environments: here the loop belongs to the caller."""
-    defaults = {"wrap": None, "action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None}
+    defaults = {"wrap": None, "action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None, "parameters": {}}
     changed = [
         f"environment.{name}={getattr(spec, name)}"
         for name, default in defaults.items()

@@ -100,7 +100,7 @@ class EnvironmentCollector:
         return make_games(spec.environment, count, self._modules, partial(rating_copies, spec.league, count))
 
     def begin(self, runtime: PolicyRuntime, spec: ActorSpec, seed: int, epsilon: float = 0.0) -> None:
-        """See Collector. The environments are reset when the first snapshot is loaded, which may carry lessons."""
+        """See Collector. With lessons, the environments are reset when the first snapshot is loaded, which has them."""
         environments = self._environments
         assert environments is not None
         environment_seed, *action_seed = np.random.SeedSequence(seed).generate_state(4).tolist()  # of 32 bits each
@@ -121,7 +121,11 @@ class EnvironmentCollector:
         if spec.lessons:
             draws = LessonDraws(spec, np.random.default_rng([*action_seed, 2]))
             self._lessons = EpisodeLessons(environments.count, spec, draws, environments.set_parameters)
-        self._reset = partial(environments.reset, environment_seed % (_SEEDS - environments.count))
+        reset = partial(environments.reset, environment_seed % (_SEEDS - environments.count))
+        if self._lessons is None:
+            self._writer.start(reset())
+        else:
+            self._reset = reset  # until the first snapshot has the lessons
 
     def load(self, snapshot: Snapshot) -> None:
         """See Collector."""

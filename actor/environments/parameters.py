@@ -41,6 +41,11 @@ class ReadOptions(dict[str, Any]):
         self.read.add(name)
         return super().pop(name, *default)
 
+    def setdefault(self, name: str, default: Any = None) -> Any:
+        """See dict."""
+        self.read.add(name)
+        return super().setdefault(name, default)
+
     def __iter__(self) -> Iterator[str]:
         self.read.update(super().keys())  # whoever has all names may read each
         return super().__iter__()
@@ -83,6 +88,7 @@ class WithParameters(gymnasium.Wrapper):
         super().__init__(environment)
         self._name = name
         self.next_parameters: Parameters = parameters
+        self._true = parameters
         self._set: Parameters = {}  # as they are now
         self._first = True  # whether no reset has succeeded yet
         has_method = environment.has_wrapper_attr(_METHOD)
@@ -121,9 +127,12 @@ class WithParameters(gymnasium.Wrapper):
         except (Exception, SystemExit) as error:  # of the user's code
             changed = next(name for name, value in given.items() if self._set.get(name) != value)
             print_traceback(error)
+            section = "environment.parameters" if given[changed] == self._true.get(changed) else "lessons"
+            remedy = f"if it refuses a value, change {section}.{changed}"
+            if isinstance(error, TypeError) and "'options'" in str(error):
+                remedy = f"give its reset the argument options, or give it a method {_METHOD}"
             raise EnvironmentSetupError(
-                f"environment {self._name}: {what} raises {first_line(error)}{place_of(error)}: if it refuses a value, "
-                f"change lessons.{changed} or environment.parameters.{changed}"
+                f"environment {self._name}: {what} raises {first_line(error)}{place_of(error)}: {remedy}"
             ) from None
 
     def _unknown(self, name: str, known: Any, reason: str) -> EnvironmentSetupError:

@@ -71,8 +71,8 @@ def fixed_changes(before: RunSpec, after: RunSpec) -> list[str]:
 
 def differing(before: RunSpec, after: RunSpec) -> list[str]:
     """Return the settings in which two specifications differ, as `section.key`."""
-    old = _values(before)
-    return [name for name, value in _values(after).items() if value != old[name]]
+    old, new = _values(before), _values(after)  # [lessons] has the keys that the user gives it
+    return [name for name in {**old, **new} if old.get(name) != new.get(name)]
 
 
 def _named(assignments: Sequence[str]) -> list[str]:

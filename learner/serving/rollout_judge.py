@@ -256,7 +256,7 @@ class RolloutJudge:
         """Return the size limits of an upload, from the specification and the actor's number of environments."""
         if self._spec.uploads_gradients:
             return gradient_limits(self._spec, self.gradient_shapes, spaces, environments)
-        row = _ROW_BYTES + sum(spaces.masks.values())
+        row = _ROW_BYTES + sum(spaces.masks.values()) + 8 * len(self._spec.lessons)  # an episode may be a row long
         for space in spaces.actions.values():
             row += space.size * (_INTEGER_BYTES if isinstance(space, DiscreteSpace) else 4)
         rows = self._spec.collection.rollout_length

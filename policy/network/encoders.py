@@ -138,7 +138,9 @@ def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModu
         return FlatEncoder(spaces, spec)
     if len(spaces) == 1:
         if coded:
-            raise NetworkError(f"the encoder {spec.encoder!r} takes no codes: set policy.encoder to mlp or grid")
+            raise NetworkError(
+                f"the encoder {spec.encoder!r} takes no codes: set policy.encoder to mlp or grid, or policy.codes=none"
+            )
         name, space = next(iter(spaces.items()))
         if isinstance(space, DiscreteSpace):
             raise NetworkError(f"the encoder {spec.encoder!r} takes arrays, not {space}: set policy.encoder to mlp")

@@ -11,6 +11,7 @@ from building import make_rollout, run_spec
 
 from daedalus.learner.run.counters import check_counters
 from daedalus.learner.run.lesson_progress import LessonProgress, LessonState, lessons_violation
+from daedalus.learner.run.resuming import differing
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout
@@ -63,6 +64,23 @@ def test_only_episodes_with_the_present_value_lead_to_the_next_one() -> None:
     lessons.add([episodes(*[(10.0, 1.0)] * 9)], 11)
     assert lessons.texts(11) == {NAME: "10 (the true task)"}
     assert lessons.means() == {NAME: 10.0}  # as acknowledged, over the newest episodes
+
+
+def test_one_false_return_does_not_end_a_step() -> None:
+    run = spec(steps=[1.0, 5.0], above=0.5)
+    run = run.model_copy(update={"training": run.training.model_copy(update={"target_episodes": 20})})
+    lessons = LessonProgress(run)
+    lessons.add([episodes((1.0, 1e6)), *[episodes((1.0, 0.0))] * 30], 1)
+    assert drawn(lessons) == [(1.0, 1.0, 1.0)]
+    lessons.add([episodes((1.0, 0.6))] * 20, 2)
+    assert drawn(lessons) == [(5.0, 5.0, 1.0)]
+
+
+def test_a_run_may_resume_with_and_without_a_lesson() -> None:
+    plain = run_spec(target_episodes=4).model_dump(mode="json")
+    without = RunSpec.model_validate({**plain, "environment": {**plain["environment"], "parameters": {NAME: 10.0}}})
+    with_one = spec(start=2.0, until_env_steps=100)
+    assert differing(without, with_one) == differing(with_one, without) == [f"lessons.{NAME}"]
 
 
 def test_a_range_is_drawn_more_often_where_the_return_changes() -> None:
