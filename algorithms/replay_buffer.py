@@ -85,6 +85,11 @@ class ReplayBuffer:
         """Rows of all columns together."""
         return self.columns * self._rows
 
+    @property
+    def rows_added(self) -> int:
+        """Rows to learn from that were ever added."""
+        return self._last
+
     def __len__(self) -> int:
         """Return the number of transitions that can be sampled."""
         return self._last - self._first

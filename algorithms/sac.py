@@ -41,9 +41,9 @@ class TwinCritics(nn.Module):
         self.biases = nn.ParameterList([_uniform(inputs, (2, 1, outputs)) for inputs, outputs in pairs])
         self._activate = torch.relu if spec.activation == "relu" else torch.tanh
 
-    def forward(self, normalized: Components, actions: Tensor) -> Tensor:
+    def forward(self, prepared: Components, actions: Tensor) -> Tensor:
         """Return both values [2, B] of actions [B, D] in observations, each [B, *stacked_shape]."""
-        features = torch.cat([self.encoder(normalized).float(), actions], -1)
+        features = torch.cat([self.encoder(prepared).float(), actions], -1)
         hidden = features.expand(2, *features.shape)
         *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for inner_weight, inner_bias in layers:
@@ -130,7 +130,7 @@ class Sac(Algorithm):
         self, now: Components, then: Components, actions: Tensor, rewards: Tensor, discounts: Tensor, noise: Tensor
     ) -> tuple[Tensor, ...]:
         rows, temperature = len(rewards), self._log_temperature.exp()
-        now, then = self._network.normalizer(now), self._network.normalizer(then)
+        now, then = self._network.prepare(now), self._network.prepare(then)
         with self._precision():
             with torch.no_grad():
                 next_actions, next_log_probs = self._choose(then, noise[rows:])
@@ -148,9 +148,9 @@ class Sac(Algorithm):
         terms = (policy_loss.detach(), value_loss.detach(), entropy, entropy.new_zeros(()))
         return policy_gradient, critic_gradient, temperature_gradient, *terms
 
-    def _choose(self, normalized: Components, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def _choose(self, prepared: Components, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions of the policy [B, D] and their log-densities [B], made from noise [B, D]."""
-        features = self._network.encoder(normalized).float()
+        features = self._network.encoder(prepared).float()
         device = features.device.type
         with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
             parameters = self._network.policy_head(features)

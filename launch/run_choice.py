@@ -1,6 +1,7 @@
 """What a user chose to run, and the settings, spaces and directory that a new run gets from it."""
 
 import copy
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,8 @@ from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +95,15 @@ class RunChoice:
         if self.algorithm is not None:
             changed.setdefault("training", {})["algorithm"] = self.algorithm
         self._change(changed)  # which may choose the algorithm, too
-        choose_algorithm(settings, changed.get("training", {}).get("algorithm"))
+        algorithm = changed.get("training", {}).get("algorithm")
+        replaced = choose_algorithm(settings, algorithm)
+        if replaced and self.preset is not None and self.preset not in preset_names():
+            _logger.warning(
+                "%s replaces these settings of %s with those of its own defaults: %s; choose others with --set",
+                algorithm,
+                self.preset,
+                ", ".join(replaced),
+            )
         shortcuts = {
             ("training", "seed"): self.seed,
             ("training", "env_steps"): self.env_steps,

@@ -167,7 +167,7 @@ class LearnerService:
         if not (isinstance(learner, ReplayLearner) and self._context.spec.training.replay_saved):
             return ()
         files = ReplayFiles(self._context.directory, learner)
-        files.load()
+        files.load(self._heartbeat.beat)
         return (files.begin,)
 
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer", loop: "TrainingLoop") -> Outcome:

@@ -106,6 +106,7 @@ class TrainingLoop:
         """Offer the policy to the actors, before the first update."""
         learner = self._learner
         self._server.rollouts.updates_of = learner.updates_of
+        self._server.rollouts.start_from(learner.policy_version + learner.updates_due)
         self._server.offer_policy(program, learner.state_size, learner.gradient_shapes)
         if self._context.spec.uploads_gradients:
             self._server.publisher.extras = lambda: learner.gradient_inputs(self._context.progress)

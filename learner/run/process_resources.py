@@ -7,6 +7,7 @@ the system allows, and is raised only while a thread writes files.
 
 import contextlib
 import ctypes
+import re
 import sys
 import threading
 from collections.abc import Iterator
@@ -89,8 +90,10 @@ def available_memory() -> int | None:
     except (OSError, ValueError, IndexError):
         pass
     try:
-        limit, used = ((_CONTROL_GROUP / name).read_text("ascii") for name in ("memory.max", "memory.current"))
-        found.append(max(int(limit) - int(used), 0))  # the limit may be "max"
+        names = ("memory.max", "memory.current", "memory.stat")
+        limit, used, statistics = ((_CONTROL_GROUP / name).read_text("ascii") for name in names)
+        files = re.search(r"^inactive_file (\d+)$", statistics, re.MULTILINE)  # read before, and given up when needed
+        found.append(max(int(limit) - int(used) + (int(files[1]) if files else 0), 0))  # the limit may be "max"
     except (OSError, ValueError):
         pass
     return min(found, default=None)

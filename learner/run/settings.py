@@ -187,8 +187,10 @@ def assign(settings: dict[str, Any], path: str, value: Any) -> None:
         _assign(section, key, value)
 
 
-def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
+def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> list[str]:
     """Set the algorithm, unless it is None, and apply the preset's `[for_algorithm.NAME]` settings for it.
+
+    Return the settings that had other values before, as `section.key`.
 
     sac, where the preset is of another algorithm and has none for it, gets the settings in defaults/sac.toml.
 
@@ -205,9 +207,14 @@ def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
         file = importlib.resources.files("daedalus.learner.run.defaults") / f"{_REPLAY}.toml"
         tables = {_REPLAY: tomllib.loads(file.read_text("utf-8"))}
     chosen = training.get("algorithm", TrainingSpec.model_fields["algorithm"].default)
+    replaced = []
     for section, values in (tables.get(chosen, {}) if isinstance(chosen, str) else {}).items():
         for key, value in values.items():
-            _assign(settings.setdefault(section, {}), key, value)
+            present = settings.setdefault(section, {})
+            if key in present and present[key] != value:
+                replaced.append(f"{section}.{key}")
+            _assign(present, key, value)
+    return replaced
 
 
 def _check_for_algorithm(tables: Any) -> None:

@@ -269,6 +269,11 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
+    def start_from(self, version: int) -> None:
+        """Accept rollouts of this policy version, which updates that are due will make without a further batch."""
+        with self._lock:
+            self._version = max(self._version, version)
+
     def count_trained(
         self,
         rollouts: Sequence[Upload],
@@ -332,7 +337,7 @@ class RolloutIntake:
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
                 actors[rollout.identity.actor].env_steps += rollout.env_steps
-        self._version = version + updates
+        self._version = max(self._version, version + updates)
 
     def _updates_of(self, uploads: Sequence[Upload]) -> int:
         return updates_of(self._spec.training, uploads, memory=self._judge.state_size > 0)

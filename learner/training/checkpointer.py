@@ -208,16 +208,14 @@ class Checkpointer:
     def _save(
         self, saving: Saving, encoded: EncodedCheckpoint, in_use: Set[Path], write_replay: Callable[[], None]
     ) -> None:
-        began, keep, what = time.monotonic(), self._spec.service.keep_checkpoints, "checkpoint"
+        began, keep = time.monotonic(), self._spec.service.keep_checkpoints
         try:
             if self._newest is not None and not (self._context.directory / CONFIG).exists():
                 self._restore_config()
             save_checkpoint(self._context.directory, encoded, keep=keep, also_keep=in_use)
-            what = "replay buffer"
-            write_replay()
         except OSError as error:
             fault = error.strerror or type(error).__name__
-            saving.result = f"{what} not saved: {fault}"
+            saving.result = f"checkpoint not saved: {fault}"
             if not self._health.save_fault and not saving.last:
                 text = (
                     f"{saving.result}; the previous checkpoint is kept, training continues, "
@@ -237,6 +235,12 @@ class Checkpointer:
         self._events.add("checkpoint", text, level=level)
         self._health.saved, self._health.save_fault = time.monotonic(), ""
         self._newest, self._env_steps = (saving.policy_version, saving.directory), saving.env_steps
+        try:
+            write_replay()
+        except OSError as error:
+            text = f"replay buffer not saved: {error.strerror or type(error).__name__}; "
+            text += "a resumed run would begin without its newest transitions" if saving.last else "this is retried"
+            self._events.add("checkpoint", text, level=logging.WARNING)
 
     def _restore_config(self) -> None:
         """Write config.toml again, without which nobody can resume the run. Raises OSError."""

@@ -5,8 +5,9 @@ costs what has been added since the last one, whatever the size of the buffer. P
 dropped are removed, so that the folder is no larger than the buffer, but for one part.
 """
 
-import itertools
+import errno
 import logging
+import math
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -19,13 +20,14 @@ from pydantic import BaseModel, ValidationError
 
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.training.replay_learner import ReplayLearner
-from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, remove_sealed, write_sealed
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, UnreadableError, remove_sealed, write_sealed
 
 _logger = logging.getLogger(__name__)
 
 FOLDER = "replay"
 _COLUMNS_FILE = "columns.safetensors"
 _PART_BYTES = 64 << 20  # about the largest part
+_MOST_COPIED = 1 << 30
 _SLACK_BYTES = 64 << 10  # of a file, besides its arrays
 _NAME = re.compile(r"([0-9]{12})-([0-9]{12})")  # its first column, and the one after its last, over the whole run
 
@@ -44,20 +46,27 @@ class ReplayFiles:
         """`directory` is that of the run."""
         self._folder, self._learner, self._buffer = directory / FOLDER, learner, learner.replay
         self._skipped = 0  # columns of the run that this process has not: the numbers of files count them, too
-        self._saved = 0  # columns of the buffer, over all that were added, up to which they are saved
+        self._loaded: dict[str, int] = {}  # columns of the buffer up to each part that was loaded
+        # Columns of the buffer, over all that were added, up to which they are saved, and up to which that has begun.
+        self._saved = self._begun = 0
 
-    def load(self) -> None:
+    def load(self, beat: Callable[[], None] = lambda: None) -> None:
         """Fill the buffer with what is saved, oldest first. A damaged part is left out, with a warning.
 
-        Raises CheckpointMismatchError, in one line, for a buffer of another run, or of other spaces or rollouts.
+        `beat` is called before each part. Raises UnreadableError for a part that may be whole, and, in one line,
+        CheckpointMismatchError for a buffer of another run, or of other spaces or rollouts.
         """
         parts = list(self._parts())
         for path, _ in parts:
+            beat()
             try:
                 self._buffer.add_columns(self._read(path))
+            except UnreadableError:
+                raise
             except DamagedError as error:
                 _logger.warning("a part of the replay buffer is left out: %s", error)
-        self._saved = self._buffer.columns_added
+            self._loaded[path.name] = self._buffer.columns_added
+        self._saved = self._begun = self._buffer.columns_added
         if parts:
             self._skipped = parts[-1][1] - self._saved
             _logger.info("replay buffer: %s transitions of %s", f"{len(self._buffer):,}", self._folder)
@@ -100,25 +109,40 @@ class ReplayFiles:
     def begin(self) -> Callable[[], None]:
         """Copy the columns that are not saved, between two updates, and return what writes them, on any thread.
 
-        The next call is after the writing has ended. It raises OSError on a disk error; the columns are then saved with
-        the next ones.
+        At most a gigabyte is copied at a time; the rest is for the next calls. What writes raises OSError on a disk
+        error, and if what was begun before it has failed; the columns are then saved with the next ones.
         """
-        added = self._buffer.columns_added
-        oldest = max(added - self._buffer.columns, 0)
-        first = max(self._saved, oldest)
-        arrays = self._buffer.copied(first, added)
-        content = {"run": self._learner.replay_identity, "columns": self._shapes()}
-        column = sum(values[:1].nbytes for values in arrays.values()) or 1
+        buffer = self._buffer
+        oldest, begun = max(buffer.columns_added - buffer.columns, 0), self._begun
+        if self._saved and not self._folder.is_dir():  # moved or removed: all is written again
+            begun = self._saved = oldest
+        first = max(begun, oldest)
+        column = sum(math.prod(shape) * dtype.itemsize for shape, dtype in buffer.shapes().values())
         step = max(_PART_BYTES // column, 1)
+        after = min(buffer.columns_added, first + max(_MOST_COPIED // column, 1))
+        arrays = buffer.copied(first, after)
+        content = {"run": self._learner.replay_identity, "columns": self._shapes()}
+        self._begun = after
 
         def write() -> None:
-            for begin in range(first, added, step):
-                end = min(begin + step, added)
-                part = {name: np.ascontiguousarray(each[begin - first : end - first]) for name, each in arrays.items()}
-                name = f"{begin + self._skipped:012d}-{end + self._skipped:012d}"
-                write_sealed(self._folder / name, {_COLUMNS_FILE: safetensors.numpy.save(part)}, content)
-                self._saved = end
-            for path, _ in itertools.takewhile(lambda part: part[1] <= oldest + self._skipped, self._parts()):
+            if self._saved != begun:
+                raise OSError(errno.EIO, "those before are not saved")
+            try:
+                for begin in range(first, after, step):
+                    end = min(begin + step, after)
+                    part = {
+                        name: np.ascontiguousarray(each[begin - first : end - first]) for name, each in arrays.items()
+                    }
+                    name = f"{begin + self._skipped:012d}-{end + self._skipped:012d}"
+                    write_sealed(self._folder / name, {_COLUMNS_FILE: safetensors.numpy.save(part)}, content)
+                    self._saved = end
+            except OSError:
+                self._begun = self._saved
+                raise
+            self._saved = after
+            for path, end in list(self._parts()):
+                if self._loaded.get(path.name, end - self._skipped) > oldest:
+                    break
                 remove_sealed(path)
             for unfinished in self._folder.glob(".*.partial"):  # left by a crash
                 shutil.rmtree(unfinished, ignore_errors=True)

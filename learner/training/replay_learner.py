@@ -4,9 +4,7 @@ import math
 import secrets
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,7 +61,7 @@ class ReplayLearner(Learner):
     def updates_of(self, rollouts: Sequence[Upload]) -> int:
         """Return the number of updates that the learner makes after it has received these rollouts."""
         steps = sum(rollout.agent_steps for rollout in rollouts)
-        if len(self.replay) + steps < self._begin:
+        if self.replay.rows_added + steps < self._begin or not (len(self.replay) or steps):
             return 0
         return math.floor(float(self._owed) + self._spec.updates_per_env_step * steps)
 
@@ -80,7 +78,7 @@ class ReplayLearner(Learner):
         self.far_outside = {}
         if rollouts:
             steps = sum(rollout.agent_steps for rollout in rollouts)
-            if len(self.replay) + steps >= self._begin:
+            if self.replay.rows_added + steps >= self._begin:
                 self._owed += self._spec.updates_per_env_step * steps
             self._receive(rollouts)
         end = time.monotonic() + _SLICE_SECONDS
@@ -92,8 +90,8 @@ class ReplayLearner(Learner):
     def _receive(self, rollouts: Sequence[Rollout]) -> None:
         batch, kept, seen = self._sorted_out(rollouts)
         for rollout in kept:
-            share = np.float32(self._reward_shares[rollout])
-            self.replay.add(replace(rollout, rewards=rollout.rewards * share) if share < 1.0 else rollout)
+            # With the rewards as they came: what a few short rollouts confirm would keep rare rewards small for ever.
+            self.replay.add(rollout)
         self._merge_observations([seen[rollout] for rollout in kept])
         self.metrics.add_batch(batch)
 

@@ -1,6 +1,8 @@
 """The learner with a replay buffer: how many updates, resume, and the buffer on the disk."""
 
+import errno
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from building import identity, make_rollout
 
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.training import replay_files
 from daedalus.learner.training.replay_files import FOLDER, ReplayFiles
 from daedalus.learner.training.replay_learner import ReplayLearner
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
@@ -141,6 +144,59 @@ def test_saved_parts_are_no_more_than_the_buffer_and_one(tmp_path: Path) -> None
     other.step([rollout(30)], 0.0)
     saved(other, tmp_path, files)  # goes on after the newest
     assert max(path.name for path in (tmp_path / FOLDER).iterdir()) == "000000000040-000000000042"
+
+
+def test_a_save_that_begins_while_another_writes_doubles_nothing(tmp_path: Path) -> None:
+    learner = trained(ReplayLearner(spec_of(), SPACES), 0)
+    files = ReplayFiles(tmp_path, learner)
+    first = files.begin()
+    second = files.begin()
+    trained(learner, 1)
+    third = files.begin()
+    for write in (first, second, third):
+        write()
+    other, _ = resumed(learner, tmp_path, spec_of())
+    assert contents(other) == contents(learner)
+
+
+def test_a_failed_save_is_made_up_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = trained(ReplayLearner(spec_of(), SPACES), 0)
+    files = ReplayFiles(tmp_path, learner)
+    first = files.begin()
+    trained(learner, 1)
+    second = files.begin()
+    with monkeypatch.context() as failing:
+        failing.setattr(replay_files, "write_sealed", full)
+        for write in (first, second):
+            with pytest.raises(OSError, match=r"space|not saved"):
+                write()
+    files.begin()()
+    other, _ = resumed(learner, tmp_path, spec_of())
+    assert contents(other) == contents(learner)
+
+
+def full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_rare_rewards_are_stored_as_they_came() -> None:
+    learner = ReplayLearner(spec_of(), SPACES)
+    for seed in range(40):
+        one = rollout(seed)
+        one.rewards[:] = 0.0
+        one.rewards[1, 0] = 100.0 if seed % 20 == 0 else 0.0
+        learner.step([one], 0.0)
+    stored = learner.replay.transitions(learner.replay.learned_rows, 1, 0.9).rewards
+    assert sorted(stored.tolist())[-3:] == [0.0, 100.0, 100.0]
+
+
+def test_critics_read_codes_as_the_policy_does() -> None:
+    spaces = SPACES.model_copy(update={"observations": {"map": ArraySpace(shape=(5, 5, 2), dtype="uint8")}})
+    spec = spec_of({"policy": {"codes": {"map": (3, 4)}}, "collection": {"rollout_length": 16}})
+    one = replace(rollout(0, rows=16), frames={"map": np.ones((17, ENVIRONMENTS, 5, 5, 2), np.uint8)})
+    learner = ReplayLearner(spec, spaces)
+    learner.step([one], 0.0)
+    assert learner.policy_version > 0
 
 
 def test_a_damaged_part_is_left_out_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
