@@ -226,6 +226,8 @@ def test_a_killed_actor_and_a_killed_learner_are_restarted_and_training_reaches_
     (victim,) = [pid for pid in processes_mentioning("actor-1") if pid in processes_mentioning(address)]
     os.kill(victim, signal.SIGKILL)
     running.expect("actor-1 was killed by signal 9; started again")
+    left = ("left", "actor-1")  # events are written every few seconds
+    until(lambda: left in [(event.kind, event.actor) for event in read_events(tmp_path / "fallen-run")])
     (victim,) = {*processes_mentioning("--prepared")} & {*processes_mentioning("fallen-run")}
     os.kill(victim, signal.SIGKILL)
     assert running.wait() in (0, 3), running.output
