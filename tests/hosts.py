@@ -6,8 +6,11 @@ The switch is in a namespace too, so that the network of the machine does not ch
 import secrets
 import shutil
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from processes import DAEDALUS, Running
 
 _SWITCH = "switch"
@@ -141,3 +144,16 @@ def _run(*words: str) -> None:
     finished = subprocess.run(words, capture_output=True, text=True, check=False)
     if finished.returncode:
         raise NoHostsError(f"`{' '.join(words)}` failed: {finished.stderr.strip() or finished.stdout.strip()}")
+
+
+@contextmanager
+def network_in(directory: Path) -> Iterator[Network]:
+    """Give a network whose processes run in a directory; skip the test where this machine cannot create one."""
+    try:
+        made = Network(directory)
+    except NoHostsError as error:
+        pytest.skip(f"this machine cannot create network namespaces: {error}")
+    try:
+        yield made
+    finally:
+        made.close()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from certificates import change_certificates
-from hosts import Host, Network, NoHostsError
+from hosts import Host, Network, NoHostsError, network_in
 from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
 
 from daedalus.cli.commands.certs import certs
@@ -22,12 +22,8 @@ LOST_CONNECTIONS = 48  # at the same time; if closing one took 10 s, the learner
 @pytest.fixture
 def network(tmp_path: Path) -> Iterator[Network]:
     shutil.copy(TESTS / "slow_environment.py", tmp_path)
-    try:
-        made = Network(tmp_path)
-    except NoHostsError as error:
-        pytest.skip(f"this machine cannot create network namespaces: {error}")
-    yield made
-    made.close()
+    with network_in(tmp_path) as made:
+        yield made
 
 
 class EndlessLearner:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hosts import Network, NoHostsError
+from hosts import Network, network_in
 from processes import DAEDALUS, Running, starting
 
 from daedalus.learner.reporting.metrics_rows import read_rows
@@ -19,12 +19,8 @@ LESSONS = ("--set", "lessons.stones.steps=[1, 2, 4, 8, 16]", "--set", "lessons.s
 @pytest.fixture
 def network(tmp_path: Path) -> Iterator[Network]:
     (tmp_path / "lessons.py").write_text(EXAMPLE.read_text())
-    try:
-        made = Network(tmp_path)
-    except NoHostsError as error:
-        pytest.skip(f"this machine cannot create network namespaces: {error}")
-    yield made
-    made.close()
+    with network_in(tmp_path) as made:
+        yield made
 
 
 def test_actors_on_two_hosts_learn_a_task_by_lessons_and_a_host_that_refuses_them_is_named(

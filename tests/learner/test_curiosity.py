@@ -120,7 +120,7 @@ def test_run_may_become_curious_at_a_resume() -> None:
 def test_warning_says_once_that_observations_do_not_come_back(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(curiosity, "_JUDGED_ROWS", 50)
+    monkeypatch.setattr(curiosity, "_JUDGED_ROWS", 50)  # as few as there are here
     learner = Learner(TrainingSpec(curiosity=1.0), POLICY, SPACES)
     for batch in walk(1, 8):
         learner.step(batch, 0.0)

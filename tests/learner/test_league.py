@@ -333,7 +333,7 @@ def test_an_actor_gets_plans_and_versions_and_the_ratings_are_in_the_status(tmp_
             request = encode(LeagueRequest(actor=actor))
             return decode(reader.query(keys.snapshots("run"), request, timeout=LIMIT)[0], Limits())
 
-        assert isinstance(plan_for("stranger"), Refusal)  # who has not joined begins no league
+        assert isinstance(plan_for("stranger"), Refusal)  # it has not joined
         report = decode(reader.query(keys.status("run"), timeout=LIMIT)[0], Limits())
         assert isinstance(report, StatusReport)
         plan = plan_for(report.status.actors[0].actor)

@@ -216,8 +216,8 @@ def test_a_damaged_part_is_left_out_with_a_warning(tmp_path: Path, caplog: pytes
 
 def test_the_buffer_of_another_run_or_of_other_rollouts_is_refused(tmp_path: Path) -> None:
     spec = spec_of()
-    learner, stranger = (trained(ReplayLearner(spec, SPACES), 0) for _ in range(2))
-    saved(stranger, tmp_path)
+    learner, other = (trained(ReplayLearner(spec, SPACES), 0) for _ in range(2))
+    saved(other, tmp_path)
     with pytest.raises(CheckpointMismatchError, match=r"of another run: remove the folder .*replay"):
         resumed(learner, tmp_path, spec)
     shutil.rmtree(tmp_path / FOLDER)

@@ -185,7 +185,7 @@ def test_training_goes_on_and_a_learner_ends_while_its_disk_does_not_answer(
     monkeypatch.setattr(recorder, "_CLOSE_SECONDS", 0.1)
     monkeypatch.setattr(heartbeat, "_END_SECONDS", 0.1)
     monkeypatch.setattr(run_context, "SLOW_DISK_SECONDS", 0.0)
-    monkeypatch.setattr(received_orders, "_ANSWER_SECONDS", 0.05)
+    monkeypatch.setattr(received_orders, "_ANSWER_SECONDS", 0.05)  # none comes: the test need not wait
     operator = MemoryTransport(network)
 
     def order() -> Acknowledgement:

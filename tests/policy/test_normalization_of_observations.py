@@ -47,6 +47,7 @@ def test_compact_snapshot_changes_no_statistic(normalizer: ObservationNormalizer
 def test_statistics_are_set_without_reading_the_parameters(normalizer: ObservationNormalizer) -> None:
     """Parameters on a GPU cannot be combined with statistics on the CPU; those on "meta" cannot be read either."""
     normalizer.to("meta")
+    # Reading them would raise an exception.
     normalizer.set_statistics("o", torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
 
 
