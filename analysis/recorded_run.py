@@ -192,7 +192,7 @@ def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
     """
     return RecordedRun(
         directory=directory,
-        settings=_settings(directory / CONFIG),
+        settings=read_run_settings(directory),
         metrics=_metrics(directory, (ENV_STEPS, RETURN, *columns)),
         summary=_summary(directory / SUMMARY),
     )
@@ -209,8 +209,9 @@ def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
     return dict(read_run(one_run(Path(directory))).metrics)
 
 
-def _settings(path: Path) -> dict[str, Any]:
-    settings = read_toml(path)
+def read_run_settings(directory: Path) -> dict[str, Any]:
+    """Return the settings of a run by `section.key`; empty without config.toml. Raises RunDataError."""
+    settings = read_toml(directory / CONFIG)
     if not settings:
         return {}
     try:

@@ -6,12 +6,21 @@ import shutil
 import stat
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from daedalus.analysis.recorded_run import ENV_STEPS, ENVIRONMENT, RATING, NoMetricsError, RecordedRun, read_run
+from daedalus.analysis.recorded_run import (
+    ENV_STEPS,
+    ENVIRONMENT,
+    RATING,
+    NoMetricsError,
+    RecordedRun,
+    read_run,
+    read_run_settings,
+)
 from daedalus.analysis.run_archive import module_names, parts_of
 from daedalus.analysis.run_selection import Labels, read_labels
 from daedalus.learner.run.run_directory import VERSIONS
@@ -47,6 +56,7 @@ class RunEntry:
 
     directory: Path
     labels: Labels
+    settings: Mapping[str, Any]  # by `section.key`; empty if they cannot be read
     run: RecordedRun | None  # None if it has no metrics yet, or cannot be read
     problem: str  # why it cannot be read; empty if it can
     release: str  # of daedalus-rl that made it; empty if it is not known
@@ -69,7 +79,7 @@ class RunEntry:
         """What the run has reached; None if nothing is known of it, or of self-play, whose returns say nothing."""
         if self.run is None:
             return None
-        task = value_text([self.run.settings.get(f"environment.{name}") or None for name in _TASK])
+        task = value_text([self.settings.get(f"environment.{name}") or None for name in _TASK])
         evaluation = self.run.summary.get("evaluation")
         matches = evaluation.get("matches") if isinstance(evaluation, dict) else None
         if isinstance(matches, dict):
@@ -83,14 +93,8 @@ class RunEntry:
         if math.isnan(self.run.training_return) or matches is not None:
             return None
         if not self.run.trains_true_task:
-            settings = self.run.settings
-            task += value_text(
-                [
-                    settings.get("environment.training_kwargs"),
-                    settings.get("environment.no_reward_limit"),
-                    self.run.lessons,
-                ]
-            )
+            shaping = [self.settings.get(f"environment.{name}") for name in ("training_kwargs", "no_reward_limit")]
+            task += value_text([*shaping, self.run.lessons])
         return Score(value=self.run.training_return, of=_IN_TRAINING, task=task)
 
     @property
@@ -106,13 +110,14 @@ class RunEntry:
     @property
     def environment(self) -> str:
         """The environment of the run; empty if it is not known."""
-        return "" if self.run is None else bounded_text(str(self.run.settings.get(ENVIRONMENT, "")), 100)
+        return bounded_text(str(self.settings.get(ENVIRONMENT, "")), 100)
 
 
 def read_entry(directory: Path) -> RunEntry:
     """Return what a run directory says, also of one that is damaged, or has nothing yet."""
-    run, labels, problems, release = None, Labels(), list[str](), ""
+    run, settings, labels, problems, release = None, dict[str, Any](), Labels(), list[str](), ""
     try:
+        settings = read_run_settings(directory)
         with suppress(NoMetricsError):
             run = read_run(directory)
     except RunDataError as error:
@@ -125,6 +130,7 @@ def read_entry(directory: Path) -> RunEntry:
     return RunEntry(
         directory=directory,
         labels=labels,
+        settings=settings,
         run=run,
         problem="; ".join(problems),
         release=release,

@@ -10,6 +10,7 @@ from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -146,7 +147,7 @@ def made(members: dict[str, bytes], *, listed: dict[str, str] | None = None, **c
 ONE = {"x/config.toml": b"1"}
 
 
-def with_header(change: Callable[[tarfile.TarInfo], None], form: int = tarfile.USTAR_FORMAT) -> bytes:
+def with_header(change: Callable[[tarfile.TarInfo], None], form: Literal[0, 1, 2] = tarfile.USTAR_FORMAT) -> bytes:
     """Return an archive that begins with a header of our choice."""
     header = tarfile.TarInfo("x/config.toml")
     change(header)
