@@ -172,7 +172,7 @@ class Walker:
     def episode(self, agent: int = 0, *, truncated_after: int = 0) -> int:
         """Play an episode; return its length."""
         player = self.client.agents[agent]
-        self.path.set_parameters(**dict(player.parameters))
+        self.path.set_parameters(stones=int(player.parameters["stones"]))
         assert player.parameters == {"stones": self.path.stones}  # the same, whenever it is asked
         observation, _ = self.path.reset()
         for length in itertools.count(1):
