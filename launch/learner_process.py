@@ -22,7 +22,7 @@ from daedalus.launch.environment_check import expected_defaults, expected_spaces
 from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
-from daedalus.launch.run_choice import NewRun, with_record
+from daedalus.launch.run_choice import NewRun, warn_of_unread, with_record
 from daedalus.launch.supervision import evaluators
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
@@ -176,6 +176,8 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     modules = UserModules(frozenset({*options.allowed_modules, *own}), str(directory / run_directory.CONFIG))
     modules.check(spec.learner_modules)  # the learner makes no environment
     spec = with_record(spec, modules)
+    if options.prepared is None:  # else the program that prepared the run has said it
+        warn_of_unread(new.choice.assignments, new.choice.settings, spec)
     exists = (directory / run_directory.CONFIG).exists()
     return ChosenRun(spec=spec, directory=options.here / directory, exists=exists, changed=changed, modules=modules)
 

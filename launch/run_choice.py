@@ -21,6 +21,7 @@ from daedalus.learner.run.settings import (
     read_preset,
     run_spec,
     unmeasured_target,
+    unread_settings,
 )
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import UserModules, modules_of
@@ -198,7 +199,15 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
         spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
     if problem := unmeasured_target(spec):
         raise SettingsError(problem)
+    warn_of_unread(choice.assignments, choice.settings, spec)
     return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
+
+
+def warn_of_unread(assignments: Sequence[str], settings: Mapping[str, Any], spec: RunSpec) -> None:
+    """Log which settings that a user chose have no effect in the run."""
+    chosen = {*(assignment.partition("=")[0].strip() for assignment in assignments), *settings}
+    if unread := sorted(chosen & unread_settings(spec)):
+        _logger.warning("no effect in this run (algorithm %s): %s", spec.training.algorithm, ", ".join(unread))
 
 
 def with_record(spec: RunSpec, modules: UserModules) -> RunSpec:
