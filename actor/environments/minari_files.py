@@ -48,7 +48,7 @@ class Episode(NamedTuple):
 def dataset_folder(name: str) -> Path:
     """Return the folder of a dataset, which need not exist: `name` is a path, or an id of Minari's local datasets."""
     if name.startswith((".", "/", "~")) or Path(name).is_dir():
-        return Path(name).expanduser()
+        return Path(name).expanduser().absolute()  # Minari joins the parts of others twice
     _import_minari()
     from minari.storage.datasets_root_dir import get_dataset_path
 
@@ -144,10 +144,10 @@ class MinariReader:
     def _values(self, group: Any, space: gymnasium.Space, whole: str) -> Any:
         parts: dict[tuple[str | int, ...], Any] = {}
         for leaf in leaves(space, whole):
-            values = None if isinstance(leaf.space, LeftOut) else group
-            for key in leaf.path if values is not None else ():
-                values: Any = values[_key(key)]
-            parts[leaf.path] = None if values is None else values[()]
+            found = group
+            for key in () if isinstance(leaf.space, LeftOut) else leaf.path:
+                found = found[_key(key)]
+            parts[leaf.path] = None if isinstance(leaf.space, LeftOut) else found[()]
         return nested(space, (), parts)
 
     # -------------------------------------------------------------------------------------------- checks
