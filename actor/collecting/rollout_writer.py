@@ -105,6 +105,18 @@ class EpisodeCounter:
         )
 
 
+def make_learnable(spec: EnvironmentSpec, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> None:
+    """Clip and scale rewards, and bootstrap terminations, as `spec` says, in place."""
+    if spec.reward_clip is not None:
+        rewards.clip(-spec.reward_clip, spec.reward_clip, out=rewards)
+    rewards *= np.float32(spec.reward_scale)
+    if spec.bootstrap_terminations:
+        # Without a limit of rewards, both flags are a termination at the time limit.
+        given_up = terminated & truncated & (spec.no_reward_limit is not None)
+        truncated |= terminated
+        terminated[:] = given_up
+
+
 class RowInputs(NamedTuple):
     """What a policy chooses one row's actions from."""
 
@@ -153,9 +165,7 @@ class RolloutWriter:
             )
         rows = rollout_length
         self._runtime = runtime
-        self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
-        self._bootstrap_terminations = spec.bootstrap_terminations
-        self._gives_up = spec.no_reward_limit is not None  # otherwise both flags are a termination at the time limit
+        self._spec = spec
         self._random, self._count = random, count
         self._epsilon = np.full((count, 1), epsilon, np.float32)
         self._episodes = EpisodeCounter(count)
@@ -291,13 +301,7 @@ class RolloutWriter:
         `episode_info` is that of the environments (VectorEnvironment.take_episode_info).
         """
         self._row = 0
-        if self._reward_clip is not None:
-            self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
-        self._rewards *= self._reward_scale
-        if self._bootstrap_terminations:
-            given_up = self._terminated & self._truncated & self._gives_up
-            self._truncated |= self._terminated
-            self._terminated[:] = given_up
+        make_learnable(self._spec, self._rewards, self._terminated, self._truncated)
         finished = self._episodes.take_finished()
         return Rollout(
             identity=identity,

@@ -300,7 +300,8 @@ def unread_settings(spec: RunSpec) -> set[str]:
         "training.value_loss training.value_coefficient": not record.replay,
         "training.entropy_bonus training.entropy_bonus_final training.normalize_advantages": has_returns,
         "training.replay_transitions training.replay_megabytes training.replay_saved training.replay_begin "
-        "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate": record.replay,
+        "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate "
+        "training.demonstration_share": record.replay,
         "training.rmsprop_decay": training.optimizer == "rmsprop",
         "policy.separate_value_encoder": has_returns and policy.memory == "none",
         "policy.memory_units": policy.memory != "none",
