@@ -45,8 +45,8 @@ _TEXTS = (
     *(names.CONFIG, names.VERSIONS, names.SUMMARY, names.METRICS, names.EVALUATION, names.EVENTS, names.LABELS),
     *(names.REPORT, names.OUTPUT, f"{names.OUTPUT}.1", names.CONFIRMATION_OUTPUT, f"{names.CONFIRMATION_OUTPUT}.1"),
 )
-_FOLDERS = ("checkpoints", names.LEAGUE, REPLAY)  # of sealed directories
-_SEALED = rf"(?:{'|'.join(_FOLDERS)})/\w[\w.+-]*/(?:manifest\.json|seal|[a-z]+\.(?:onnx|safetensors))"
+_FOLDERS = ("checkpoints", names.LEAGUE, names.DEMONSTRATIONS, REPLAY)  # of sealed directories
+_SEALED = rf"(?:{'|'.join(_FOLDERS)})/\w[\w.+-]*/(?:manifest\.json|seal|rollout|[a-z]+\.(?:onnx|safetensors))"
 _OTHERS = r"tracker-\w[\w.-]*\.json|events\.out\.\w[\w.-]*|\w[\w .+()-]*\.(?:mp4|gif)"
 _PART = re.compile("|".join([*map(re.escape, _TEXTS), _OTHERS, _SEALED]), re.ASCII)
 _PARTIAL = re.compile(r"\..*\.partial").fullmatch

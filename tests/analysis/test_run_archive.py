@@ -23,6 +23,7 @@ from daedalus.analysis.run_archive import ArchiveError, read_archive
 from daedalus.cli.commands.runs import runs
 from daedalus.learner.run.run_directory import create
 from daedalus.learner.run.run_lock import RunLock
+from daedalus.policy.saving.sealed import write_sealed
 from daedalus.protocol.spec import RunSpec
 
 
@@ -49,6 +50,7 @@ def test_a_restored_run_is_the_run_and_plays(folder: Path, capsys: pytest.Captur
     run = save(record(folder / "runs" / "mine"), CARTPOLE, 3, 7)
     (run / "replay" / "000000000000-000000000064").mkdir(parents=True)
     (run / "replay" / "000000000000-000000000064" / "columns.safetensors").write_bytes(bytes(1000))
+    write_sealed(run / "demonstrations" / "00000000", {"rollout": b"a rollout"}, {})
     (run / "my replay (2).mp4").write_bytes(b"a video")
     said(capsys, "tag", "paper", "runs/mine")
     before = contents(run)
