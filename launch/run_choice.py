@@ -148,15 +148,22 @@ class NewRun:
     init_from: Path | None = None  # another run, or one of its checkpoints, whose weights to begin with
     other_spaces: bool = False  # accept `init_from` of other spaces
 
-    def create(self, spec: RunSpec, directory: Path) -> RunLock:
-        """Create the run directory, and return its lock. A default directory that is there gets a number."""
-        return run_directory.create_locked(
+    def create(self, spec: RunSpec, directory: Path) -> tuple[RunLock, RunSpec]:
+        """Create the run directory. A default directory that is there gets a number.
+
+        Return its lock, and the specification with the package of the environment.
+        """
+        from daedalus.actor.environments.environment_packages import with_package  # only a new run needs it
+
+        spec = spec.model_copy(update={"environment": with_package(spec.environment)})
+        lock = run_directory.create_locked(
             directory,
             spec,
             numbered=self.directory is None,
             init_from=self.init_from,
             other_spaces=self.other_spaces,
         )
+        return lock, spec
 
 
 def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Spaces | None]:
@@ -170,7 +177,7 @@ def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Sp
     check_initial(new.init_from, other_spaces=new.other_spaces)
     with Surroundings():  # which an algorithm of the user may change when it is imported
         spec, spaces = _prepared(new.choice, fork)
-    return new.create(spec, new.directory or new.choice.directory(spec)), spec, spaces
+    return *new.create(spec, new.directory or new.choice.directory(spec)), spaces
 
 
 def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
