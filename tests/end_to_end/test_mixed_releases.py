@@ -6,21 +6,19 @@ import shutil
 import subprocess
 import tarfile
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from installing import build, installed, run
-from processes import DAEDALUS, ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, starting, until
+from processes import DAEDALUS, ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, until
 
 from daedalus.protocol.releases import own_release
 
 ROOT = Path(__file__).parents[2]
-# The first commit whose Welcome carries ActorSpec: every commit since then works with every other. Replace it by the
-# first tag once there is one, and by a later commit only with a new protocol version.
-OLDEST = "2cac2d323af87bd83f4800fbe9593a2b351c893c"
-# The first commit whose orders are those of today, so that operators' commands mix, too.
-OLDEST_WITH_ORDERS = "4dc7dbc5"
+# The first commit whose orders of operators are those of today: each since then works with each other. Replace it by
+# the first tag once there is one, and by a later commit only with a new protocol version.
+OLDEST = "4dc7dbc5"
 # A later release whose Join and Welcome earlier ones cannot read.
 LATER = """
 import importlib.metadata, runpy, sys
@@ -33,18 +31,6 @@ runpy.run_module(f"daedalus.cli.commands.{sys.argv.pop(1)}", run_name="__main__"
 """
 
 Start = Callable[..., Running]
-
-
-@pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
-    with starting(tmp_path) as start:
-        yield start
-
-
-@pytest.fixture(scope="module")
-def older(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Return the command `daedalus` of the oldest commit."""
-    return daedalus_of(OLDEST, tmp_path_factory.mktemp("older"))
 
 
 def daedalus_of(commit: str, folder: Path) -> list[str]:
@@ -65,24 +51,9 @@ def daedalus_of(commit: str, folder: Path) -> list[str]:
     return [python, *DAEDALUS[1:]]
 
 
-@pytest.mark.parametrize("older_role", ["actor", "learner"])
-def test_actor_and_learner_of_different_releases_train_together(
-    start: Start, older: list[str], older_role: str
-) -> None:
-    address = free_address()
-    commands = {role: older if role == older_role else DAEDALUS for role in ("actor", "learner")}
-    run_of_the_test = ("cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 3000)
-    learner = start("learner", *run_of_the_test, command=commands["learner"])
-    learner.expect("actors join with")
-    actor = start("actor", "--connect", address, "--name", "other", "--envs", 4, command=commands["actor"])
-    actor.expect("joined run 'run'")
-    assert learner.wait() == 3, learner.output  # the budget, learned from accepted rollouts
-    assert actor.wait() == 0, actor.output
-
-
 def test_a_fleet_is_upgraded_host_by_host_without_a_pause_for_its_actors(start: Start, tmp_path: Path) -> None:
     """Actors may be newer than the learner, and older. A checkpoint and commands of the older release are used."""
-    older, address, own = daedalus_of(OLDEST_WITH_ORDERS, tmp_path / "older"), free_address(), own_release()
+    older, address, own = daedalus_of(OLDEST, tmp_path / "older"), free_address(), own_release()
     start("router", "--listen", address).expect("listening")
     exporter = start("exporter", "--connect", address, "--listen", "127.0.0.1:0")
     learner = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS, *SLOW, command=older)
