@@ -8,6 +8,10 @@ import functools
 import importlib.metadata
 import re
 
+from pydantic import ValidationError
+
+from daedalus.protocol.texts import bounded_text
+
 _DISTRIBUTION = "daedalus-rl"
 _RELEASE = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,31} [0-9][A-Za-z0-9.+-]{0,31}", re.ASCII)  # a name and a version
 
@@ -17,7 +21,20 @@ REPLACED_SETTINGS = {
     "environment.patience": "environment.no_reward_limit",
     "service.metrics_writers": "the option --log module:Class of `daedalus train` and `daedalus learner`",
 }
+_MOST_DESCRIBED = 100  # faults of a model; pydantic describes all or none
 REPLACED_VALUES = {("environment.backend", "sketch"): "fast"}
+
+
+def unknown_settings(error: ValidationError) -> str:
+    """Return which settings this release does not know, and what replaced each; without any, the kind of error."""
+    if error.error_count() > _MOST_DESCRIBED:
+        return f"{error.error_count():,} values are not valid"
+    paths = [".".join(map(str, each["loc"])) for each in error.errors() if each["type"] == "extra_forbidden"]
+    texts = [
+        f"{replacement} replaces {path}" if (replacement := REPLACED_SETTINGS.get(path)) else f"unknown setting {path}"
+        for path in paths
+    ]
+    return bounded_text("; ".join(texts) or type(error).__name__)
 
 
 @functools.cache

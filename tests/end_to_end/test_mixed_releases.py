@@ -13,7 +13,8 @@ import pytest
 from installing import build, installed, run
 from processes import DAEDALUS, ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, until
 
-from daedalus.protocol.releases import own_release
+from daedalus.learner.run.setting_errors import known_names
+from daedalus.protocol.releases import REPLACED_SETTINGS, own_release
 
 ROOT = Path(__file__).parents[2]
 # The first commit whose orders of operators are those of today: each since then works with each other. Replace it by
@@ -33,14 +34,19 @@ runpy.run_module(f"daedalus.cli.commands.{sys.argv.pop(1)}", run_name="__main__"
 Start = Callable[..., Running]
 
 
-def daedalus_of(commit: str, folder: Path) -> list[str]:
-    """Return the command `daedalus` of an environment with the wheel of a commit, as release 0.0.1."""
+def of_oldest(*words: str) -> bytes:
+    """Return the output of a command of git about the oldest commit."""
     if not shutil.which("git"):
         pytest.skip("git, which has the older commit, is not installed")
-    archive = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=False)
-    if archive.returncode:
-        pytest.skip(f"{ROOT} has no history with commit {commit[:7]}: fetch it with `git fetch --unshallow`")
-    with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
+    found = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, check=False)
+    if found.returncode:
+        pytest.skip(f"{ROOT} has no history with commit {OLDEST}: fetch it with `git fetch --unshallow`")
+    return found.stdout
+
+
+def older_daedalus(folder: Path) -> list[str]:
+    """Return the command `daedalus` of an environment with the wheel of the oldest commit, as release 0.0.1."""
+    with tarfile.open(fileobj=io.BytesIO(of_oldest("archive", OLDEST))) as files:
         files.extractall(folder / "tree", filter="data")
     project = folder / "tree" / "pyproject.toml"
     project.write_text(re.sub(r'^version = ".*"', 'version = "0.0.1"', project.read_text(), flags=re.MULTILINE))
@@ -53,7 +59,7 @@ def daedalus_of(commit: str, folder: Path) -> list[str]:
 
 def test_a_fleet_is_upgraded_host_by_host_without_a_pause_for_its_actors(start: Start, tmp_path: Path) -> None:
     """Actors may be newer than the learner, and older. A checkpoint and commands of the older release are used."""
-    older, address, own = daedalus_of(OLDEST, tmp_path / "older"), free_address(), own_release()
+    older, address, own = older_daedalus(tmp_path / "older"), free_address(), own_release()
     start("router", "--listen", address).expect("listening")
     exporter = start("exporter", "--connect", address, "--listen", "127.0.0.1:0")
     learner = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS, *SLOW, command=older)
@@ -83,6 +89,14 @@ def test_a_fleet_is_upgraded_host_by_host_without_a_pause_for_its_actors(start: 
     assert start("drain", "old", "--connect", address, command=older).wait() == 0
     assert stays.wait() == 0, stays.output
     upgraded.expect(r"updates .*/s")
+
+
+def test_a_setting_that_went_is_named_with_what_replaced_it() -> None:
+    reference = of_oldest("show", f"{OLDEST}:docs/reference/settings.md").decode()
+    before = re.findall(r"^\| `(\w+)\.(\w+)` \|", reference, re.MULTILINE)
+    assert len(before) > 80
+    went = [f"{section}.{name}" for section, name in before if name not in known_names([section])]
+    assert set(went) <= REPLACED_SETTINGS.keys()  # add what is missing, with what replaces it
 
 
 def test_too_old_processes_name_the_release_that_they_need(start: Start, address: str) -> None:
