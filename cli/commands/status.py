@@ -287,7 +287,7 @@ def _table(status: RunStatus) -> list[str]:
     agents = "" if status.agent_steps is None else f" ({status.agent_steps:,} agent_steps)"
     return [
         f"run {status.run}: {status.environment}, {status.algorithm}, up {status.uptime_seconds:.0f} s, "
-        f"epoch {status.learner_epoch:x}",
+        f"epoch {status.learner_epoch:x}{f', {status.software}' if status.software else ''}",
         *(f"  PROBLEM: {problem}" for problem in status.problems),
         *_expiry(status.certificate_days_left),
         f"  {rating}return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}{agents}, "
@@ -307,6 +307,7 @@ def _table(status: RunStatus) -> list[str]:
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
         *(f"  {actor.actor} {text}" for actor in status.actors for text in _actor_texts(actor)),
         *_places(status.actors),
+        *_releases(status),
         *map(_refused, status.refused_joins),
     ]
 
@@ -422,6 +423,22 @@ def _places(actors: Sequence[ActorStatus]) -> list[str]:
         f"  on {host or 'an unknown host'}{f', {software}' if software else ''}: {', '.join(names)}"
         for (host, software), names in by_host.items()
     ]
+
+
+def _releases(status: RunStatus) -> list[str]:
+    """Return which releases take part, if there are several: the fleet is being upgraded."""
+    counts = status.releases
+    if len(counts) < 2:
+        return []
+    named = [
+        f"{software or 'unknown'}: {' and '.join(filter(None, ('the learner' * of_learner, _actors(count))))}"
+        for software, (of_learner, count) in counts.items()
+    ]
+    return [f"  releases: {'; '.join(named)}"]
+
+
+def _actors(count: int) -> str:
+    return f"{count:,} actor{'s' * (count > 1)}" if count else ""
 
 
 def _client_texts(actor: ActorStatus) -> list[str]:
