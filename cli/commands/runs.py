@@ -284,7 +284,9 @@ def _prune(parsed: argparse.Namespace) -> int:
             try:
                 remove_run(entry.directory)
             except (OSError, RunDataError, SettingsError) as error:
-                print_error("runs", f"{entry.directory} is not removed: {error}" if isinstance(error, OSError) else error)
+                print_error(
+                    "runs", f"{entry.directory} is not removed: {error}" if isinstance(error, OSError) else error
+                )
                 failed = True
                 continue
         freed += entry.size
