@@ -259,10 +259,10 @@ class LearnerProcess:
             return NOT_REACHED if finished.missed else REACHED
         if resumed and options.new.demonstrations is not None:
             _logger.info("the demonstrations are those that the run began with, if it has any")
-        if run.changed:
+        restored = _newest_checkpoint(run.directory) if resumed else None
+        if run.changed:  # only now: a run that cannot go on stays as it was
             _logger.info("settings of the run changed: %s", ", ".join(run.changed))
             run_directory.write_config(run.directory, run.spec)
-        restored = _newest_checkpoint(run.directory) if resumed else None
         spaces = options.spaces
         if restored is None and options.prepared is None:
             run, spaces = self._with_spaces(run)
