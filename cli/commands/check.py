@@ -2,9 +2,7 @@
 
 import argparse
 import os
-import sys
 from collections.abc import Iterator
-from contextlib import redirect_stdout
 from dataclasses import replace
 
 import numpy as np
@@ -114,10 +112,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
 
 
 def _report(check: EnvironmentCheck) -> EnvironmentReport:
-    """Check an environment, in a process of its own where the system has such processes."""
-    if not hasattr(os, "posix_spawn"):  # Windows
-        with redirect_stdout(sys.stderr):  # the environment may print
-            return check.run()
+    """Check an environment in a process of its own."""
     try:
         return check_in_process(check)
     except CheckTimeoutError as error:
