@@ -167,7 +167,7 @@ def check_learner_installed() -> None:
     """Raise SettingsError if this installation has no learner."""
     if absent := [name for name in _LEARNER_PACKAGES if importlib.util.find_spec(name) is None]:
         raise SettingsError(
-            f'this is the installation of an actor, and a learner needs {" and ".join(absent)}: '
+            f"this is the installation of an actor, and a learner needs {' and '.join(absent)}: "
             'pip install "daedalus-rl[learner]"; for once: uvx --from "daedalus-rl[learner]" daedalus ...'
         )
 

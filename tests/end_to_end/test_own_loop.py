@@ -1,4 +1,4 @@
-"""Loops that the caller owns, and actors where a system lacks what only POSIX has."""
+"""Loops that the caller owns, and learners and actors where a system lacks what only POSIX has."""
 
 import json
 import sys
@@ -76,12 +76,12 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def portable(tmp_path: Path) -> Iterator[Start]:
-    """Start a script or a function without what only POSIX has."""
+    """Start a Python process that, with its children, lacks what only POSIX has."""
     running: list[Running] = []
 
-    def start(what: str, *arguments: object) -> Running:
-        line = [sys.executable, str(TESTS / "without_posix.py"), what, *map(str, arguments)]
-        running.append(Running(line, tmp_path))
+    def start(*arguments: object) -> Running:
+        lacking = f"PYTHONPATH={TESTS / 'without_posix'}"
+        running.append(Running(["env", lacking, sys.executable, *map(str, arguments)], tmp_path))
         return running[-1]
 
     yield start
@@ -89,17 +89,39 @@ def portable(tmp_path: Path) -> Iterator[Start]:
         one.end()
 
 
-def test_an_actor_and_a_client_run_to_the_end(start: Start, address: str, portable: Start) -> None:
-    learner = start("learner", "cartpole", *SMALL, "--listen", address, "--run-dir", "run")
-    actor = portable("daedalus.cli.commands.actor:main", "--connect", address, "--name", "plain", "--envs", 2)
-    loop = portable(str(OWN_LOOP), address, "--name", "robot")
+def test_a_learner_an_actor_and_a_client_run_to_the_end(address: str, portable: Start) -> None:
+    learner = portable("-m", "daedalus", "learner", "cartpole", *SMALL, "--listen", address, "--run-dir", "run")
+    learner.expect("this system has no such locks: start no second learner in")
+    actor = portable("-m", "daedalus", "actor", "--connect", address, "--name", "plain", "--envs", 2)
+    loop = portable(OWN_LOOP, address, "--name", "robot")
     assert learner.wait() == 3, learner.output  # the budget ended without the target
     for ended in (actor, loop):
         assert ended.wait() == 0, ended.output
         ended.expect("the run is over")
 
 
-def test_the_command_starts_the_actor_as_a_child(portable: Start) -> None:
-    command = portable("daedalus.cli.main:main", "actor")
-    assert command.wait() == 2, command.output
-    command.expect("the following arguments are required: --connect")
+def test_a_whole_training_runs_and_its_end_saves_a_checkpoint(portable: Start, tmp_path: Path) -> None:
+    stop = (
+        "import daedalus, sys\n"
+        "class Stop(daedalus.Callback):\n"
+        "    def on_metrics(self, run, metrics): run.stop('enough')\n"
+        "small = {'collection.rollout_length': 32, 'evaluation.final_episodes': 1, 'service.log_seconds': 0.2,\n"
+        "    'training.stop_when_solved': False}\n"
+        "daedalus.train('cartpole', env_steps=10**9, settings=small, run_dir='run', callback=Stop())\n"
+    )
+    training = portable("-c", stop)
+    training.expect("every user of this machine can connect to tcp/127.0.0.1:")
+    assert training.wait() == 0, training.output
+    assert (tmp_path / "run" / "summary.json").exists()
+    assert list((tmp_path / "run" / "checkpoints").iterdir())
+
+
+def test_every_module_of_the_learner_is_imported(portable: Start) -> None:
+    program = (
+        "import importlib, pkgutil, daedalus.algorithms, daedalus.learner, daedalus.launch, daedalus.policy\n"
+        "for package in (daedalus.algorithms, daedalus.learner, daedalus.launch, daedalus.policy):\n"
+        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        importlib.import_module(module.name)\n"
+    )
+    imported = portable("-c", program)
+    assert imported.wait() == 0, imported.output

@@ -1,13 +1,9 @@
-"""Runs a script, or a function that returns an exit status, without what Windows does not have.
+"""What Windows does not have is removed from each Python process whose PYTHONPATH has this folder, and its children.
 
-    python tests/without_posix.py SCRIPT.py|MODULE:FUNCTION ARGUMENT...
-
-They are removed before anything of ours or of our dependencies is imported.
+Python imports this module at its start, before anything of ours or of our dependencies.
 """
 
-import importlib
 import os
-import runpy
 import select
 import signal
 import subprocess  # noqa: F401 - chooses by the platform, before it seems to be another
@@ -21,13 +17,12 @@ OF_OS = (
     *(
         "pwrite",
         "readv",
-        "register_at_fork",
         "sched_getaffinity",
         "sched_setaffinity",
         "sched_yield",
     ),
     *("setpriority", "setsid", "setuid", "statvfs", "sync", "sysconf", "wait", "wait3", "wait4", "writev"),
-    *("O_DIRECTORY", "O_NOFOLLOW", "O_CLOEXEC", "O_NONBLOCK", "WNOHANG", "execv"),
+    *("O_DIRECTORY", "O_NOFOLLOW", "O_CLOEXEC", "O_NONBLOCK", "execv"),
 )
 OF_SIGNAL = (
     *("SIGALRM", "SIGCHLD", "SIGCONT", "SIGHUP", "SIGKILL", "SIGPIPE", "SIGQUIT", "SIGSTOP", "SIGTSTP", "SIGUSR1"),
@@ -35,16 +30,9 @@ OF_SIGNAL = (
     *("sigtimedwait", "sigwait", "sigwaitinfo"),
 )
 
-if __name__ == "__main__":
-    for absent in MODULES:
-        sys.modules[absent] = None  # type: ignore[assignment] - which makes an import of it fail
-    for module, names in ((os, OF_OS), (signal, OF_SIGNAL), (select, ("poll", "epoll", "kqueue"))):
-        for name in names:
-            if hasattr(module, name):
-                delattr(module, name)
-    sys.argv = sys.argv[1:]
-    found, _, function = sys.argv[0].partition(":")
-    if not function:
-        runpy.run_path(found, run_name="__main__")
-    else:
-        raise SystemExit(getattr(importlib.import_module(found), function)())
+for absent in MODULES:
+    sys.modules[absent] = None  # type: ignore[assignment] - which makes an import of it fail
+for module, names in ((os, OF_OS), (signal, OF_SIGNAL), (select, ("poll", "epoll", "kqueue"))):
+    for name in names:
+        if hasattr(module, name):
+            delattr(module, name)
