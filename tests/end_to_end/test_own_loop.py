@@ -1,6 +1,7 @@
 """Loops that the caller owns, and learners and actors where a system lacks what only POSIX has."""
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -100,20 +101,14 @@ def test_a_learner_an_actor_and_a_client_run_to_the_end(address: str, portable: 
         ended.expect("the run is over")
 
 
-def test_a_whole_training_runs_and_its_end_saves_a_checkpoint(portable: Start, tmp_path: Path) -> None:
-    stop = (
-        "import daedalus, sys\n"
-        "class Stop(daedalus.Callback):\n"
-        "    def on_metrics(self, run, metrics): run.stop('enough')\n"
-        "small = {'collection.rollout_length': 32, 'evaluation.final_episodes': 1, 'service.log_seconds': 0.2,\n"
-        "    'training.stop_when_solved': False}\n"
-        "daedalus.train('cartpole', env_steps=10**9, settings=small, run_dir='run', callback=Stop())\n"
-    )
-    training = portable("-c", stop)
+def test_a_training_that_is_stopped_saves_a_checkpoint(portable: Start) -> None:
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    training = portable("-m", "daedalus", "train", "cartpole", *endless, "--run-dir", "run")
     training.expect("every user of this machine can connect to tcp/127.0.0.1:")
-    assert training.wait() == 0, training.output
-    assert (tmp_path / "run" / "summary.json").exists()
-    assert list((tmp_path / "run" / "checkpoints").iterdir())
+    training.expect(r" env_steps +[1-9]")
+    training.process.send_signal(signal.SIGINT)  # to this process alone
+    assert training.wait() == 1, training.output
+    training.expect(r"stopped; checkpoint saved at [1-9][\d,]* env_steps: run/checkpoints/")
 
 
 def test_every_module_of_the_learner_is_imported(portable: Start) -> None:

@@ -6,8 +6,10 @@ Python imports this module at its start, before anything of ours or of our depen
 import os
 import select
 import signal
-import subprocess  # noqa: F401 - chooses by the platform, before it seems to be another
+import subprocess  # chooses by the platform, before it seems to be another
 import sys
+from collections.abc import Collection
+from typing import Any
 
 MODULES = ("fcntl", "grp", "posix_ipc", "pty", "pwd", "readline", "resource", "syslog", "termios", "tty", "uvloop")
 OF_OS = (
@@ -36,3 +38,13 @@ for module, names in ((os, OF_OS), (signal, OF_SIGNAL), (select, ("poll", "epoll
     for name in names:
         if hasattr(module, name):
             delattr(module, name)
+
+
+class _Popen(subprocess.Popen):
+    def __init__(self, *arguments: Any, pass_fds: Collection[int] = (), **options: Any) -> None:
+        if pass_fds:
+            raise ValueError("pass_fds not supported on Windows.")
+        super().__init__(*arguments, **options)
+
+
+subprocess.Popen = _Popen
