@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from daedalus.launch.run_choice import RunChoice, warn_of_unread
 from daedalus.learner.run.run_directory import read_config, write_config
 from daedalus.learner.run.settings import (
     SettingsError,
@@ -18,6 +19,7 @@ from daedalus.learner.run.settings import (
     read_preset,
     read_settings,
     run_spec,
+    unread_settings,
 )
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
@@ -308,6 +310,8 @@ def test_value_out_of_range_error_names_the_range(assignment: str, range_: str) 
     [
         ("training.learning_rte=0.1", "unknown setting training.learning_rte: did you mean training.learning_rate"),
         ("trainin.seed=1", "unknown setting trainin: did you mean training?"),
+        ("environment.patience=9", "patience is of an earlier release: environment.no_reward_limit replaces it"),
+        ("environment.backend=sketch", "backend is 'sketch', which is of an earlier release: 'fast' replaces it"),
         ("policy.zzz=1", "the settings are activation, codes, distribution, encoder, hidden"),
         (f"environment.kwargs.size={10**30}", "environment.kwargs cannot be sent to actors: "),
         *((f"training.target_return={value}", "setting training.target_return ") for value in ("nan", "inf")),
@@ -396,6 +400,44 @@ def test_sac_replaces_the_settings_of_another_algorithm_and_keeps_its_own() -> N
     settings["policy"]["hidden"] = [32]  # such as in the config.toml of a run
     choose_algorithm(settings, "sac")
     assert settings["policy"]["hidden"] == [32]
+
+
+@pytest.mark.parametrize(
+    ("settings", "unread", "read"),
+    [
+        ({}, "training.passes training.trace_clip policy.memory_units training.n_step", "training.trace_lambda"),
+        ({"training": {"algorithm": "appo"}}, "training.rho_clip training.target_rate", "training.passes"),
+        ({"training": {"algorithm": "appo", "exploration": [0.1]}}, "training.trace_clip", "training.rho_clip"),
+        ({"training": {"algorithm": "one_step_q"}}, "training.trace_lambda", "training.target_period"),
+        ({"training": {"optimizer": "rmsprop"}}, "policy.mixture_components", "training.rmsprop_decay"),
+        ({"policy": {"memory": "gru"}}, "policy.separate_value_encoder", "policy.memory_units"),
+        ({"training": {"algorithm": "my:Algorithm"}}, "", "training.passes training.n_step"),
+        (
+            {
+                "training": {"algorithm": "sac"},
+                "policy": {"distribution": "squashed_gaussian", "state_dependent_std": True},
+            },
+            "training.entropy_bonus training.passes policy.separate_value_encoder",
+            "training.n_step",
+        ),
+    ],
+)
+def test_settings_that_nothing_reads_are_known(settings: dict[str, Any], unread: str, read: str) -> None:
+    training = {"algorithm": "a3c", **settings.get("training", {})}
+    made = run_spec({"environment": {"id": "CartPole-v1"}, **settings, "training": training})
+    found = unread_settings(made)
+    assert set(unread.split()) <= found
+    assert not set(read.split()) & found
+    for name in found:  # all exist
+        section, key = name.split(".")
+        assert hasattr(getattr(made, section), key)
+
+
+def test_settings_of_the_user_that_nothing_reads_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    spec = RunChoice(env="CartPole-v1", algorithm="a2c").spec()
+    warn_of_unread(["training.clip_range=0.3"], {"training.passes": 2, "training.seed": 2}, spec)
+    warn_of_unread(["training.learning_rate=0.1"], {}, spec)
+    assert caplog.messages == ["no effect in this run (algorithm a2c): training.clip_range, training.passes"]
 
 
 @pytest.mark.parametrize("table", [3, {"impala": 3}, {"impala": {"training": 3}}])
