@@ -97,9 +97,9 @@ def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.Monke
 
 
 def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[subprocess.Popen[bytes]] = []
+    started: list[subprocess.Popen[Any]] = []
 
-    def popen(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+    def popen(*arguments: Any, **options: Any) -> subprocess.Popen[Any]:
         started.append(start(*arguments, **options))
         return started[-1]
 
