@@ -22,7 +22,7 @@ from daedalus.launch.environment_check import expected_defaults, expected_spaces
 from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
-from daedalus.launch.run_choice import NewRun, warn_of_unread, with_record
+from daedalus.launch.run_choice import NewRun, check_learner_installed, warn_of_unread, with_record
 from daedalus.launch.supervision import evaluators
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
@@ -159,6 +159,7 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     Modules that the command line itself names are allowed; those that only an existing config.toml names need
     --allow-module. Raises SettingsError or UserModuleError.
     """
+    check_learner_installed()
     if options.reset_statistics and not options.resume:
         raise SettingsError("--reset-statistics needs --resume: a new run has no statistics")
     new = options.new
