@@ -98,7 +98,7 @@ def explained_variance(values: Tensor, targets: Tensor, shares: Tensor) -> Tenso
     """
     spread = variance(targets, shares)
     differ = spread > _NEGLIGIBLE * mean(targets.square(), shares)
-    return torch.where(differ, 1.0 - variance(targets - values, shares) / spread, torch.nan)
+    return (1.0 - variance(targets - values, shares) / spread).masked_fill(~differ, torch.nan)
 
 
 def variance(values: Tensor, shares: Tensor) -> Tensor:
