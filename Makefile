@@ -88,7 +88,7 @@ docs-reference: .venv/ready-train
 	touch $@
 
 .venv/ready-test: .venv/ready-train
-	$(PIP) -e ".[learner,analysis,certs,box2d,mujoco,minigrid,pettingzoo,envpool,atari,video,monitoring,wandb,mlflow,hub,gateway,browser,docs,dev]"
+	$(PIP) -e ".[learner,analysis,certs,box2d,mujoco,minigrid,pettingzoo,envpool,atari,video,demonstrations,monitoring,wandb,mlflow,hub,gateway,browser,docs,dev]"
 	touch $@
 
 # Hashes of the packages of the images and of releases. torch and its requirements are left out: an index has the CPU

@@ -3,7 +3,7 @@
 State in main memory; no I/O, no threads.
 """
 
-import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +14,6 @@ from daedalus.policy.network.layers import Components
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.uploads import Rollout
 
-_OTHER_BYTES = 24  # of a row: its reward, flags, age, and index among the rows to learn from, rounded up
-
 
 class Transitions(NamedTuple):
     """B transitions, from the observation of a row to the one that its target bootstraps from."""
@@ -25,6 +23,21 @@ class Transitions(NamedTuple):
     actions: Tensor  # [B, D] float32, all components side by side
     rewards: Tensor  # [B], the sum of the discounted rewards up to the next observation
     discounts: Tensor  # [B], of the value of the next observation; 0 after a termination
+
+
+def joined(parts: Sequence[Transitions]) -> Transitions:
+    """Return transitions one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    return Transitions(
+        observations={name: torch.cat([each.observations[name] for each in parts]) for name in parts[0].observations},
+        next_observations={
+            name: torch.cat([each.next_observations[name] for each in parts]) for name in parts[0].next_observations
+        },
+        actions=torch.cat([each.actions for each in parts]),
+        rewards=torch.cat([each.rewards for each in parts]),
+        discounts=torch.cat([each.discounts for each in parts]),
+    )
 
 
 class ReplayBuffer:
@@ -69,16 +82,6 @@ class ReplayBuffer:
         self._first = self._last = 0  # of the queue, counted over all rows that ever were in it
         self._counts = np.zeros(self.columns, np.int64)  # rows to learn from in each column
         self.columns_added = 0  # ever
-
-    @staticmethod
-    def bytes_of_column(spaces: Spaces, rollout_length: int) -> int:
-        """Return the memory that a column takes, in bytes."""
-        frames = sum(
-            (space.frames + rollout_length) * math.prod(space.shape) * np.dtype(space.dtype).itemsize
-            for space in spaces.observations.values()
-        )
-        actions = 4 * sum(space.size for space in spaces.actions.values())
-        return frames + rollout_length * (actions + _OTHER_BYTES)
 
     @property
     def capacity(self) -> int:
@@ -168,6 +171,11 @@ class ReplayBuffer:
             rewards=torch.from_numpy(rewards),
             discounts=torch.from_numpy(discounts),
         )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the full buffer takes, in bytes."""
+        return sum(values.nbytes for values in (*self._arrays.values(), self._queue))
 
     @property
     def learned_rows(self) -> np.ndarray:

@@ -68,6 +68,12 @@ def add_new_run(options: argparse.ArgumentParser) -> None:
         help="accept --init-from of a run whose observations or actions have other names, kinds or bounds: the weights "
         "are loaded if their shapes fit",
     )
+    options.add_argument(
+        "--demonstrations",
+        metavar="DATASET",
+        help="learn from recorded episodes, too: a Minari dataset, as a folder or an id of `minari list local`, with "
+        "the spaces of the environment. Its episodes are copied into the run directory. For sac",
+    )
     options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
     add_log(options)
 
@@ -114,4 +120,5 @@ def new_run(arguments: argparse.Namespace) -> NewRun:
         directory=arguments.run_dir,
         init_from=arguments.init_from,
         other_spaces=arguments.allow_other_spaces,
+        demonstrations=arguments.demonstrations,
     )

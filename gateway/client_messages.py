@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import msgpack
 
 from daedalus.actor.collecting.client_seats import MatchSeat, match_seats
+from daedalus.protocol.lessons import Parameters
 
 ErrorCode = Literal[
     "malformed",  # not a message of this protocol
@@ -39,6 +40,7 @@ State = Literal["new", "ready", "acted"]
 # What a client may send in each state, and the state after the gateway's answer.
 TRANSITIONS: dict[tuple[State, str], State] = {
     ("new", "hello"): "ready",
+    ("ready", "parameters"): "ready",
     ("ready", "act"): "acted",
     ("acted", "act"): "acted",
     ("acted", "reward"): "acted",
@@ -47,7 +49,7 @@ TRANSITIONS: dict[tuple[State, str], State] = {
 _HINTS = {
     "new": "send a hello first",
     "ready": "send an act first: the episode has no action yet",
-    "acted": "a connection has one hello",
+    "acted": "a connection has one hello, and parameters are asked for before an episode",
 }
 
 
@@ -59,6 +61,12 @@ class Hello(NamedTuple):
     actions: Any
     token: str
     match: tuple[MatchSeat, ...] = ()  # the seats that the client holds; empty: it plays no match
+
+
+class AskParameters(NamedTuple):
+    """A client asks for the parameters of the environment in the episode that begins next."""
+
+    seat: str = ""
 
 
 class Act(NamedTuple):
@@ -87,10 +95,11 @@ class EndEpisode(NamedTuple):
     seat: str = ""
 
 
-ClientMessage = Hello | Act | Reward | EndEpisode
+ClientMessage = Hello | AskParameters | Act | Reward | EndEpisode
 
 _FIELDS: dict[str, tuple[set[str], set[str]]] = {  # required and optional fields of each type
     "hello": ({"version", "name", "observations", "actions"}, {"token", "match"}),
+    "parameters": (set(), {"seat"}),
     "act": ({"observation"}, {"action_mask", "reward", "override", "seat"}),
     "reward": ({"reward"}, {"seat"}),
     "end_episode": ({"terminated"}, {"observation", "reward", "seat"}),
@@ -124,6 +133,8 @@ def read(data: str | bytes, states: Mapping[str, State]) -> ClientMessage:
     if missing:
         raise ClientError("malformed", f"{kind} lacks the field {min(missing)!r}")
     match kind:
+        case "parameters":
+            return AskParameters(seat)
         case "act":
             reward = _number(message.get("reward", 0.0))
             return Act(message["observation"], message.get("action_mask"), reward, message.get("override"), seat)
@@ -207,6 +218,12 @@ def encode(message: dict[str, Any], *, as_text: bool) -> str | bytes:
 def welcome(run: str, environment: str, name: str) -> dict[str, Any]:
     """Return the answer to hello."""
     return {"type": "welcome", "version": VERSION, "run": run, "environment": environment, "name": name}
+
+
+def parameters(values: Parameters, seat: str = "") -> dict[str, Any]:
+    """Return the answer to parameters."""
+    message = {"type": "parameters", "parameters": dict(values)}
+    return {**message, "seat": seat} if seat else message
 
 
 def action(value: Any, seat: str = "") -> dict[str, Any]:

@@ -22,7 +22,7 @@ from daedalus.launch.environment_check import expected_defaults, expected_spaces
 from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
-from daedalus.launch.run_choice import NewRun, with_record
+from daedalus.launch.run_choice import NewRun, warn_of_unread, with_record
 from daedalus.launch.supervision import evaluators
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
@@ -176,6 +176,8 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     modules = UserModules(frozenset({*options.allowed_modules, *own}), str(directory / run_directory.CONFIG))
     modules.check(spec.learner_modules)  # the learner makes no environment
     spec = with_record(spec, modules)
+    if options.prepared is None:  # else the program that prepared the run has said it
+        warn_of_unread(new.choice.assignments, new.choice.settings, spec)
     exists = (directory / run_directory.CONFIG).exists()
     return ChosenRun(spec=spec, directory=options.here / directory, exists=exists, changed=changed, modules=modules)
 
@@ -255,6 +257,8 @@ class LearnerProcess:
         if finished is not None:
             _logger.info("nothing to do: %s", finished.reason)
             return NOT_REACHED if finished.missed else REACHED
+        if resumed and options.new.demonstrations is not None:
+            _logger.info("the demonstrations are those that the run began with, if it has any")
         if run.changed:
             _logger.info("settings of the run changed: %s", ", ".join(run.changed))
             run_directory.write_config(run.directory, run.spec)
@@ -269,7 +273,7 @@ class LearnerProcess:
         if transport is None:  # stopped while no router answered
             return stopped
         stack.callback(transport.close)
-        run = run if run.exists else self._with_directory(run, stack)
+        run = run if run.exists else self._with_directory(run, spaces, stack)
         try:
             say = self._progress.say
             # The launcher of a prepared run writes output.log itself: a file has one writer.
@@ -288,9 +292,9 @@ class LearnerProcess:
             raise
         return _status(outcome, run.spec, stopped, UNSAVED if options.supervised else FAILED)
 
-    def _with_directory(self, run: ChosenRun, stack: ExitStack) -> ChosenRun:
+    def _with_directory(self, run: ChosenRun, spaces: Spaces | None, stack: ExitStack) -> ChosenRun:
         """Create the directory of a new run, and return the run in it; `stack` unlocks it."""
-        lock = stack.enter_context(self._options.new.create(run.spec, run.directory))
+        lock = stack.enter_context(self._options.new.create(run.spec, run.directory, spaces))
         self._context["run"] = run_directory.run_name(lock.directory)
         return replace(run, directory=lock.directory)
 

@@ -21,6 +21,7 @@ from daedalus.learner.run.settings import (
     read_preset,
     run_spec,
     unmeasured_target,
+    unread_settings,
 )
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import UserModules, modules_of
@@ -147,16 +148,31 @@ class NewRun:
     directory: Path | None = None  # None: a new folder in runs/
     init_from: Path | None = None  # another run, or one of its checkpoints, whose weights to begin with
     other_spaces: bool = False  # accept `init_from` of other spaces
+    demonstrations: str | None = None  # dataset to learn from, too
 
-    def create(self, spec: RunSpec, directory: Path) -> RunLock:
-        """Create the run directory, and return its lock. A default directory that is there gets a number."""
-        return run_directory.create_locked(
+    def create(self, spec: RunSpec, directory: Path, spaces: Spaces | None = None) -> RunLock:
+        """Create the run directory, with its demonstrations, and return its lock.
+
+        A default directory that is there gets a number. `spaces` are those of the run, if they are known. Raises
+        SettingsError.
+        """
+        lock = run_directory.create_locked(
             directory,
             spec,
             numbered=self.directory is None,
             init_from=self.init_from,
             other_spaces=self.other_spaces,
         )
+        if self.demonstrations is not None:
+            from daedalus.launch.demonstrations import write_demonstrations  # what other runs need not import
+
+            try:
+                write_demonstrations(self.demonstrations, spec, spaces, lock.directory)
+            except BaseException:
+                run_directory.remove_failed(lock.directory)
+                lock.close()
+                raise
+        return lock
 
 
 def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Spaces | None]:
@@ -170,7 +186,7 @@ def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Sp
     check_initial(new.init_from, other_spaces=new.other_spaces)
     with Surroundings():  # which an algorithm of the user may change when it is imported
         spec, spaces = _prepared(new.choice, fork)
-    return new.create(spec, new.directory or new.choice.directory(spec)), spec, spaces
+    return new.create(spec, new.directory or new.choice.directory(spec), spaces), spec, spaces
 
 
 def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
@@ -183,7 +199,15 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
         spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
     if problem := unmeasured_target(spec):
         raise SettingsError(problem)
+    warn_of_unread(choice.assignments, choice.settings, spec)
     return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
+
+
+def warn_of_unread(assignments: Sequence[str], settings: Mapping[str, Any], spec: RunSpec) -> None:
+    """Log which settings that a user chose have no effect in the run."""
+    chosen = {*(assignment.partition("=")[0].strip() for assignment in assignments), *settings}
+    if unread := sorted(chosen & unread_settings(spec)):
+        _logger.warning("no effect in this run (algorithm %s): %s", spec.training.algorithm, ", ".join(unread))
 
 
 def with_record(spec: RunSpec, modules: UserModules) -> RunSpec:

@@ -77,6 +77,7 @@ def train(
     wrap: str | None = None,
     init_from: str | Path | None = None,
     allow_other_spaces: bool = False,
+    demonstrations: str | Path | None = None,
     callback: Callback | None = None,
     log: str | Sequence[str] = (),
     quiet: bool = False,
@@ -102,6 +103,7 @@ def train(
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
       init_from: another run, or one of its checkpoints, whose weights to begin with, of equal network and spaces.
       allow_other_spaces: accept `init_from` of other spaces: the weights are loaded if their shapes fit.
+      demonstrations: a Minari dataset to learn from, too: its folder, or its id among the local datasets.
       callback: called with each row of metrics; it can log metrics of its own and end training.
       log: trackers to log the run to, of "wandb", "mlflow" and "trackio", or "module:Class" for a metrics writer of
         your own.
@@ -132,6 +134,7 @@ def train(
         directory=None if run_dir is None else Path(run_dir),
         init_from=None if init_from is None else Path(init_from),
         other_spaces=allow_other_spaces,
+        demonstrations=None if demonstrations is None else str(demonstrations),
     )
     with given.players() as start_player:
         with _checking(quiet):

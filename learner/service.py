@@ -93,8 +93,8 @@ class LearnerService:
 
         Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
         learner serves the run, CheckpointMismatchError if a checkpoint does not fit the settings, NetworkError if
-        the policy or the algorithm does not support the spaces, SettingsError if the device is not available or
-        rollouts are too short for masked actions.
+        the policy or the algorithm does not support the spaces, SettingsError if the device is not available,
+        rollouts are too short for masked actions or demonstrations do not fit, DamagedError for damaged ones.
         """
         self._heartbeat.start()
         league = self._context.league
@@ -121,6 +121,7 @@ class LearnerService:
             else:
                 learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
             self._beginning.load_into(learner, spec, self._context.progress)
+            self._read_demonstrations(learner)
             checkpointer, loop = self._training_of(learner)
             if self._beginning.initial is not None:
                 checkpointer.begin()  # a learner that is killed before its first checkpoint continues from this one
@@ -130,6 +131,14 @@ class LearnerService:
         finally:
             self._server.close(self._why_stopped)  # unless it is closed
             self._heartbeat.clear()
+
+    def _read_demonstrations(self, learner: "Learner") -> None:
+        from daedalus.learner.training.demonstrations import read_demonstrations
+        from daedalus.learner.training.replay_learner import ReplayLearner
+
+        taken = learner.replay.nbytes if isinstance(learner, ReplayLearner) else 0
+        directory, spec = self._context.directory, self._context.spec
+        learner.demonstrations = read_demonstrations(directory, spec, learner.spaces, taken, self._heartbeat.beat)
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")

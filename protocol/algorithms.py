@@ -49,6 +49,8 @@ class AlgorithmRecord(ActorDemands):
     replay: bool = False
     """Rollouts go into a replay buffer, however old their policy is; minibatches of its transitions make the updates,
     in a fixed ratio to the env_steps."""
+    demonstrations: bool = False
+    """The learner learns from demonstrations of a dataset, too."""
     target_network: bool = False
     """The learner keeps a second network, which `Algorithm.after_update` sets and which gradients do not change."""
     epsilons: Epsilons = (0.0,)
@@ -88,6 +90,7 @@ ALGORITHMS = {
         batch_rollouts=1,
         heads="policy",
         replay=True,
+        demonstrations=True,
     ),
 }
 _OWN = re.compile(r"\w+(\.\w+)*:\w+")  # module:Class

@@ -17,6 +17,7 @@ LARGEST_REWARD = 1e9  # as learning sees it: the learner (learner/serving/rollou
 _MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
 _MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an output for each
 _MAX_COMPONENTS = 64
+_REPLAY_BYTES = 24  # of a row in a replay buffer: its reward, flags, age, and index among the rows, rounded up
 _MAX_VARIABLES = 8_192  # of all discrete and continuous components together: a Join lists their bounds
 
 
@@ -261,6 +262,14 @@ class Spaces(Specification):
             for name, space in self.actions.items()
             if isinstance(space, DiscreteSpace) and space.masked
         }
+
+    def replay_bytes(self, rows: int) -> int:
+        """Return the memory of some rows of one environment in a replay buffer (algorithms/replay_buffer.py)."""
+        frames = sum(
+            (space.frames + rows) * math.prod(space.shape) * np.dtype(space.dtype).itemsize
+            for space in self.observations.values()
+        )
+        return frames + rows * (4 * sum(space.size for space in self.actions.values()) + _REPLAY_BYTES)
 
     @property
     def listed_actions(self) -> str:

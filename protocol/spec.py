@@ -361,6 +361,8 @@ class TrainingSpec(LossSpec):
     """Transitions that each update learns from, drawn uniformly from the replay buffer."""
     n_step: Annotated[int, Field(ge=1, le=64)] = 1
     """Rewards in the target of a transition before it bootstraps; fewer at the end of an episode or a rollout."""
+    demonstration_share: UnitInterval = 0.5
+    """Share of each minibatch that comes from demonstrations, where the run has some (`--demonstrations`)."""
     target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
     """Share of the way that the target critics move to the critics at each update."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None

@@ -11,6 +11,7 @@ import numpy as np
 
 from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.uploads import Rollout
 
 
@@ -37,9 +38,16 @@ def side_by_side(rollouts: Sequence[Rollout]) -> Rollout:
         valid=np.concatenate([each.valid for each in rollouts], axis=1),
         episode_returns=np.concatenate([each.episode_returns for each in rollouts]),
         episode_lengths=np.concatenate([each.episode_lengths for each in rollouts]),
+        lessons=_episodes_joined([each.lessons for each in rollouts]),
         overridden=np.concatenate(overridden, axis=1) if any(each.any() for each in overridden) else None,
         game_steps=None if first.game_steps is None else sum(each.env_steps for each in rollouts),
     )
+
+
+def _episodes_joined(lessons: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the parameters of the episodes of all rollouts; one without an episode has none."""
+    played = [each for each in lessons if each]
+    return {name: np.concatenate([each[name] for each in played]) for name in (played[0] if played else ())}
 
 
 def _joined(arrays: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -55,6 +63,7 @@ class LoadedPolicy:
 
     version: int
     runtime: OnnxRuntime
+    lessons: LessonPlan | None = None  # in a run with lessons
 
 
 class ClientExchange:

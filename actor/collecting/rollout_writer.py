@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from daedalus.actor.collecting.episode_lessons import lesson_arrays
 from daedalus.actor.collecting.lineup import Lineup
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.vector_environments import Observed
@@ -13,6 +14,7 @@ from daedalus.policy.acting.noise import Noise, draw_noise
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -28,12 +30,19 @@ class FinishedEpisodes:
 
     returns: np.ndarray  # [K] float64, undiscounted and unscaled
     lengths: np.ndarray  # [K] int32, env_steps
+    parameters: list[Parameters]  # of each, those that have a lesson; empty in a run without parameters
 
 
 class EpisodeCounter:
-    """The running returns and lengths of E environments' episodes, and those of the episodes that ended."""
+    """The running returns and lengths of E environments' episodes, and those of the episodes that ended.
+
+    Attributes:
+      parameters: of the running episodes, those that have a lesson, by environment; empty in a run without parameters.
+    """
 
     def __init__(self, count: int) -> None:
+        self.parameters: list[Parameters] = []
+        self._played: list[Parameters] = []  # by the episodes that ended
         self._returns = np.zeros(count, np.float64)
         self._lengths = np.zeros(count, np.int32)
         self.ended = np.zeros(count, np.bool_)  # [E] whether the next step is the reset after an episode's end
@@ -46,6 +55,8 @@ class EpisodeCounter:
         self.ended = ended
         if np.count_nonzero(self.ended):
             self._finished.append((self._returns[self.ended], self._lengths[self.ended]))
+            if self.parameters:
+                self._played += [self.parameters[index] for index in np.flatnonzero(self.ended).tolist()]
             self._returns[self.ended] = 0.0
             self._lengths[self.ended] = 0
 
@@ -72,6 +83,7 @@ class EpisodeCounter:
     def cut(self) -> None:
         """Note that all episodes ended with the row that was counted last."""
         self._finished.append((self._returns.copy(), self._lengths.copy()))
+        self._played += self.parameters
         self.restart()
         self.ended[:] = True
 
@@ -84,11 +96,25 @@ class EpisodeCounter:
     def take_finished(self) -> FinishedEpisodes:
         """Return the episodes that ended since the last call."""
         finished, self._finished = self._finished, []
+        played, self._played = self._played, []
         returns, lengths = zip(*finished, strict=True) if finished else ((), ())
         return FinishedEpisodes(
             returns=np.concatenate([np.zeros(0), *returns]),
             lengths=np.concatenate([np.zeros(0, np.int32), *lengths]),
+            parameters=played,
         )
+
+
+def make_learnable(spec: EnvironmentSpec, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> None:
+    """Clip and scale rewards, and bootstrap terminations, as `spec` says, in place."""
+    if spec.reward_clip is not None:
+        rewards.clip(-spec.reward_clip, spec.reward_clip, out=rewards)
+    rewards *= np.float32(spec.reward_scale)
+    if spec.bootstrap_terminations:
+        # Without a limit of rewards, both flags are a termination at the time limit.
+        given_up = terminated & truncated & (spec.no_reward_limit is not None)
+        truncated |= terminated
+        terminated[:] = given_up
 
 
 class RowInputs(NamedTuple):
@@ -139,9 +165,7 @@ class RolloutWriter:
             )
         rows = rollout_length
         self._runtime = runtime
-        self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
-        self._bootstrap_terminations = spec.bootstrap_terminations
-        self._gives_up = spec.no_reward_limit is not None  # otherwise both flags are a termination at the time limit
+        self._spec = spec
         self._random, self._count = random, count
         self._epsilon = np.full((count, 1), epsilon, np.float32)
         self._episodes = EpisodeCounter(count)
@@ -173,6 +197,17 @@ class RolloutWriter:
     def use(self, runtime: PolicyRuntime) -> None:
         """Let another runtime of the same program choose the actions. Call only between rollouts."""
         self._runtime = runtime
+
+    @property
+    def resets(self) -> np.ndarray:
+        """Of which environments the next row is the reset after an episode's end, [E] bool."""
+        return self._episodes.ended
+
+    def play(self, index: int, parameters: Parameters) -> None:
+        """Note the parameters with lessons of an environment's next episode. Call it before the row of its reset."""
+        if not self._episodes.parameters:
+            self._episodes.parameters = [{}] * self._count
+        self._episodes.parameters[index] = parameters
 
     def start(self, observed: Observed) -> None:
         """Begin with the first observations of all environments."""
@@ -260,21 +295,13 @@ class RolloutWriter:
         identity: RolloutIdentity,
         policy_version: int,
         episode_info: dict[str, np.ndarray] | None = None,
-        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
         """Return the full rollout. Its arrays are views: encode or copy it before the next `act`.
 
-        `episode_info` is that of the environments (VectorEnvironment.take_episode_info), and `lessons` are the
-        parameters of the episodes that ended (EpisodeLessons.take_finished).
+        `episode_info` is that of the environments (VectorEnvironment.take_episode_info).
         """
         self._row = 0
-        if self._reward_clip is not None:
-            self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
-        self._rewards *= self._reward_scale
-        if self._bootstrap_terminations:
-            given_up = self._terminated & self._truncated & self._gives_up
-            self._truncated |= self._terminated
-            self._terminated[:] = given_up
+        make_learnable(self._spec, self._rewards, self._terminated, self._truncated)
         finished = self._episodes.take_finished()
         return Rollout(
             identity=identity,
@@ -292,7 +319,7 @@ class RolloutWriter:
             episode_returns=finished.returns[-self._rewards.size :],
             episode_lengths=finished.lengths[-self._rewards.size :],
             episode_info=episode_info or {},
-            lessons=lessons or {},
+            lessons=lesson_arrays(finished.parameters[-self._rewards.size :]),
             overridden=self._overridden if self._overridden.any() else None,
         )
 
@@ -449,10 +476,9 @@ class SeatWriter(RolloutWriter):
         identity: RolloutIdentity,
         policy_version: int,
         episode_info: dict[str, np.ndarray] | None = None,
-        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
-        """See RolloutWriter. No game has lessons."""
-        rollout = super().finish(identity, policy_version, episode_info, lessons)
+        """See RolloutWriter."""
+        rollout = super().finish(identity, policy_version, episode_info)
         if not self._warned and self._skipped > self._rewards.size:
             self._warned = True
             _logger.warning(

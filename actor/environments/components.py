@@ -108,6 +108,7 @@ def _without(space: Any, path: tuple[str | int, ...], paths: Collection[tuple[st
     return space
 
 
+_ROUNDING = 1e-6  # of the range of an action
 _UNBOUNDED = 1e30  # a bound beyond this value is none: environments write the largest float for infinity
 _WIDE_BYTES = 4  # integers of fewer bytes use all their range, such as the colours of a pixel
 
@@ -147,6 +148,24 @@ class BoundedActions:
         if self._rounded:
             actions = np.rint(actions)
         return actions.reshape(len(values), *self._space.shape).astype(self._space.dtype)
+
+    def values(self, actions: np.ndarray) -> np.ndarray:
+        """Return the values [E, D] float32 of actions [E, *shape]: `of` makes the actions of them again.
+
+        Raises ValueError for an action outside the bounds.
+        """
+        flat = np.asarray(actions).reshape(len(actions), -1).astype(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            slack = np.where(self._bounded, _ROUNDING * self._range, 0.0)  # bounds in float64 and actions in float32
+            outside = ~((flat >= self._low - slack) & (flat <= self._high + slack))  # also nan
+            scaled = np.where(self._range > 0.0, 2.0 * (flat - self._low) / self._range - 1.0, 0.0).clip(-1.0, 1.0)
+        outside |= ~np.isfinite(flat)
+        if outside.any():
+            row, place = np.argwhere(outside)[0]
+            raise ValueError(
+                f"the action {flat[row, place]:g} is outside its bounds {self._low[place]:g} to {self._high[place]:g}"
+            )
+        return np.where(self._bounded, scaled, flat).astype(np.float32)
 
     def exported(self, graph: "OnnxGraph", values: str) -> str:
         """Add what `of` does to an ONNX graph, in float32: [rows, D] -> [rows, D]. NaN has no centre there."""
@@ -339,6 +358,29 @@ class ActionComponents:
         """Return the environment's batched actions for values {name: [E, D]} of all components."""
         parts = {leaf.path: self._env_action(leaf, values[leaf.name]) for leaf in self._leaves}
         return nested(self._space, (), parts)
+
+    def policy_actions(self, actions: Any) -> dict[str, np.ndarray]:
+        """Return the values {name: [E, D]} of the environment's batched actions: the inverse of `env_actions`.
+
+        Raises ValueError for an action outside its space.
+        """
+        return {leaf.name: self._policy_action(leaf, leaf.of(actions)) for leaf in self._leaves}
+
+    def _policy_action(self, leaf: Leaf, actions: np.ndarray) -> np.ndarray:
+        shape = leaf.space.shape or ()
+        if actions.shape[1:] != shape or actions.dtype.kind not in "biuf":
+            raise ValueError(f"actions {described(actions)} do not fit {described(leaf.space)}")
+        if isinstance(leaf.space, gym.Box):
+            return self._bounded[leaf.name].values(actions)
+        flat = actions.reshape(len(actions), -1)
+        start = np.ravel(getattr(leaf.space, "start", 0))
+        component = self.spaces[leaf.name]
+        assert isinstance(component, DiscreteSpace)
+        choices = np.clip(flat, -(2**62), 2**62).astype(np.int64) - start
+        wrong = (choices + start != flat) | (choices < 0) | (choices >= np.array(component.counts))
+        if wrong.any():
+            raise ValueError(f"the action {flat[wrong][0]:g} is outside {described(leaf.space)}")
+        return choices.astype(component.dtype)
 
     def add_outputs(self, graph: "OnnxGraph", values: Mapping[str, str]) -> None:
         """Add what `env_actions` does to an ONNX graph, with one output for each component."""

@@ -85,6 +85,21 @@ class TableActions:
         actions[:, self._rest] = self._rest_actions.of(values[_REST])
         return actions.reshape(len(actions), *self._space.shape)
 
+    def policy_actions(self, actions: Any) -> dict[str, np.ndarray]:
+        """Return the values {name: [E, D]} of the environment's batched actions: the inverse of `env_actions`.
+
+        Raises ValueError for an action outside the space, or of which the table has no row.
+        """
+        flat = np.asarray(actions).reshape(len(actions), -1)
+        differences = np.abs(flat[:, None, self._columns].astype(np.float64) - self._table.astype(np.float64))
+        unequal = differences.max(-1) > 1e-6 * (1.0 + np.abs(self._table).max(-1))  # [E, choices]
+        if (missing := unequal.all(1)).any():
+            raise ValueError(f"environment.action_table has no row for the action {described(flat[missing][0])}")
+        choices = (~unequal).argmax(1)[:, None].astype(self.spaces[_CHOICE if self._rest.size else "action"].dtype)
+        if not self._rest.size:
+            return {"action": choices}
+        return {_CHOICE: choices, _REST: self._rest_actions.values(flat[:, self._rest])}
+
     def add_outputs(self, graph: "OnnxGraph", values: Mapping[str, str]) -> None:
         """Add what `env_actions` does to an ONNX graph: the output `action`."""
         choice = graph.reshaped(values[_CHOICE if self._rest.size else "action"], ())
@@ -265,6 +280,17 @@ class Transforms:
     def env_actions(self, actions: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for the run's {name: [E, D]}."""
         return self._actions.env_actions(actions)
+
+    def policy_actions(self, actions: Any) -> dict[str, np.ndarray]:
+        """Return the run's actions {name: [E, D]} for the environment's batched actions: `env_actions` inverted.
+
+        Raises ValueError for an action outside its space.
+        """
+        return self._actions.policy_actions(actions)
+
+    def policy_action(self, action: Any) -> dict[str, np.ndarray]:
+        """Return the run's actions {name: [1, D]} for one action of the environment. Raises as `policy_actions`."""
+        return self._actions.policy_actions(batch_of_one(self._action_space, action, "the action"))
 
     def env_action(self, actions: dict[str, np.ndarray]) -> Any:
         """Return the environment's action for the run's {name: [1, D]}."""

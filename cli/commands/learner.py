@@ -94,6 +94,11 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
+def _from(here: Path, dataset: str | None) -> str | None:
+    """Return a dataset that is named by a path as an absolute path."""
+    return str(here / dataset) if dataset is not None and (here / dataset).is_dir() else dataset
+
+
 def learner_options(arguments: argparse.Namespace, started: float, here: Path) -> LearnerOptions:
     """Return what the command line asks for.
 
@@ -104,7 +109,11 @@ def learner_options(arguments: argparse.Namespace, started: float, here: Path) -
     """
     new = new_run(arguments)
     return LearnerOptions(
-        new=replace(new, init_from=None if new.init_from is None else here / new.init_from),
+        new=replace(
+            new,
+            init_from=None if new.init_from is None else here / new.init_from,
+            demonstrations=_from(here, new.demonstrations),
+        ),
         here=here,
         prepared=arguments.prepared,
         resume=arguments.resume,

@@ -92,7 +92,8 @@ def resume_roles(parsed: argparse.Namespace, directories: Mapping[str, Path], sc
 
 def _refuse_options(parsed: argparse.Namespace) -> None:
     """Raise SettingsError for what only one run can have."""
-    one = {"--watch": parsed.watch, "--tls": parsed.tls, "--init-from": getattr(parsed, "init_from", None)}
+    one = {"--watch": parsed.watch, "--tls": parsed.tls}
+    one |= {f"--{name}": getattr(parsed, name.replace("-", "_"), None) for name in ("init-from", "demonstrations")}
     for option, value in one.items():
         if value:
             raise SettingsError(

@@ -41,6 +41,7 @@ OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
 OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
 CONFIRMATION_OUTPUT = "confirmation.log"  # of a learner's evaluator, where the launcher writes output.log
 REPORT = "report.html"
+DEMONSTRATIONS = "demonstrations"  # folder of rollouts (demonstration_files.py)
 LEAGUE = "league"  # folder of kept versions and of other runs' policies that are opponents
 TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run
 _SUPERSEDED = "superseded_by"  # in summary.json: the epoch of the newer learner
@@ -192,9 +193,9 @@ def remove_failed(directory: Path) -> None:
         for file in directory.glob(pattern):
             with suppress(OSError):
                 file.unlink()
-    for sealed in (directory / LEAGUE).glob("*"):
+    for sealed in (*(directory / LEAGUE).glob("*"), *(directory / DEMONSTRATIONS).glob("*")):
         remove_sealed(sealed)
-    for folder in (directory / "checkpoints", directory / LEAGUE, directory):
+    for folder in (directory / "checkpoints", directory / LEAGUE, directory / DEMONSTRATIONS, directory):
         with suppress(OSError):  # not empty, or a mount point
             folder.rmdir()
 

@@ -18,7 +18,7 @@ from pydantic import JsonValue, ValidationError
 
 from daedalus.learner.run.run_files import RunDataError, read_toml
 from daedalus.learner.run.setting_errors import ambiguous, known_names, one_line, unknown_setting
-from daedalus.protocol.algorithms import check_algorithm
+from daedalus.protocol.algorithms import check_algorithm, is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.texts import exact_number, without_secrets
@@ -287,6 +287,31 @@ def changed_settings(settings: Mapping[str, Any]) -> list[str]:
     defaults = {f"{section}.{key}": value for section, values in known.items() for key, value in values.items()}
     del defaults["environment.id"]
     return [path for path, value in settings.items() if path not in defaults or value != defaults[path]]
+
+
+def unread_settings(spec: RunSpec) -> set[str]:
+    """Return the settings of `policy` and `training` that nothing reads in a run with these others."""
+    policy, training, record = spec.policy, spec.training, spec.algorithm
+    if is_own(training.algorithm):
+        return set()  # which may read any
+    has_returns = record.heads == "policy_and_value"
+    unread = {
+        "training.passes training.minibatches training.clip_range training.proximal_policy": record.passes_over_batch,
+        "training.trace_lambda": not record.replay and not training.algorithm.startswith("one_step"),
+        "training.rho_clip": record.corrected or (has_returns and training.explores),
+        "training.trace_clip": record.corrected,
+        "training.target_period": record.target_network,
+        "training.value_loss training.value_coefficient": not record.replay,
+        "training.entropy_bonus training.entropy_bonus_final training.normalize_advantages": has_returns,
+        "training.replay_transitions training.replay_megabytes training.replay_saved training.replay_begin "
+        "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate "
+        "training.demonstration_share": record.replay,
+        "training.rmsprop_decay": training.optimizer == "rmsprop",
+        "policy.separate_value_encoder": has_returns and policy.memory == "none",
+        "policy.memory_units": policy.memory != "none",
+        "policy.mixture_components": policy.distribution == "gaussian_mixture",
+    }
+    return {name for names, is_read in unread.items() if not is_read for name in names.split()}
 
 
 def unmeasured_target(spec: RunSpec) -> str:

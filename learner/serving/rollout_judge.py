@@ -18,6 +18,7 @@ from daedalus.learner.serving.upload_checks import (
     first_component_violation,
     gradient_limits,
     gradient_violation,
+    number_violation,
     restored,
 )
 from daedalus.protocol.codec import ProtocolError, decode
@@ -26,7 +27,7 @@ from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.spaces import LARGEST_REWARD, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import bounded_text
-from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER, MAX_INFO_NAMES, Gradient, Rollout, Upload
+from daedalus.protocol.uploads import MAX_INFO_NAMES, Gradient, Rollout, Upload
 
 # Per environment and row, besides observations, actions and masks, rounded up; integers may be sent in 8 bytes each.
 _ROW_BYTES, _INTEGER_BYTES = 24, 8
@@ -40,17 +41,6 @@ _OTHER_ARRAYS = 17  # besides observations, actions, masks and scalars of info
 # Largest decoded rollout, whichever is larger: bytes, or rollouts with the run's own number of environments. An actor
 # chooses its number, and zeros compress to nothing: the learner's memory must not depend on the actor.
 _MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS = 64 << 20, 8
-# Largest magnitudes. No healthy actor comes near them, and beyond them squares overflow float32: updates would have no
-# finite gradient. The state of a GRU lies between -1 and 1.
-_LARGEST = {
-    "initial_state": 1.001,
-    "behaviour_log_probs": 1e6,
-    "rewards": LARGEST_REWARD,
-    "episode_returns": LARGEST_EPISODE_NUMBER,
-}
-_REMEDIES = {
-    "rewards": ": set environment.reward_scale",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -282,7 +272,7 @@ class RolloutJudge:
         return (
             self._shape_violation(rollout, actor)
             or first_component_violation(rollout, spaces, self._spec.policy)
-            or _number_violation(rollout)
+            or number_violation(rollout)
             or self._value_violation(rollout)
             or _episode_violation(rollout)
             or lessons_violation(rollout, self._spec)
@@ -325,23 +315,6 @@ def _matches(upload: Upload) -> int:
     """Return the number of matches that an upload reports."""
     counts = upload.matches.counts if isinstance(upload, Rollout) and upload.matches is not None else ()
     return sum(each.wins + each.draws + each.losses for each in counts)
-
-
-def _number_violation(rollout: Rollout) -> str:
-    """Return the first array with a value that is not finite or too large, or an empty string."""
-    for name, largest in _LARGEST.items():
-        array: np.ndarray = getattr(rollout, name)
-        if array.dtype.kind != "f" or not array.size:
-            continue
-        low, high = float(array.min()), float(array.max())  # nan if there is a nan
-        if not (math.isfinite(low) and math.isfinite(high)):
-            return f"{name} has a value that is not finite"
-        if max(-low, high) > largest:
-            return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
-    for name, values in rollout.episode_info.items():
-        if not (np.abs(values) <= LARGEST_EPISODE_NUMBER).all():
-            return f"episode_info {name!r} has a value that is not finite, or too large"
-    return ""
 
 
 def _episode_violation(rollout: Rollout) -> str:

@@ -11,6 +11,7 @@ from daedalus.protocol.compact import bits_of, float32
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.spaces import (
     LARGEST_OBSERVATION,
+    LARGEST_REWARD,
     ArraySpace,
     ContinuousSpace,
     DiscreteSpace,
@@ -33,6 +34,18 @@ from daedalus.protocol.uploads import (
 
 _MAX_LOG_DENSITY = 20.0  # of one continuous action: its density cannot be higher, and float32 hold the noise
 _MAX_ACTION = 1e6  # of a continuous action: beyond it squares lose all precision
+
+# Largest magnitudes. No healthy actor comes near them, and beyond them squares overflow float32: updates would have no
+# finite gradient. The state of a GRU lies between -1 and 1.
+_LARGEST = {
+    "initial_state": 1.001,
+    "behaviour_log_probs": 1e6,
+    "rewards": LARGEST_REWARD,
+    "episode_returns": LARGEST_EPISODE_NUMBER,
+}
+_REMEDIES = {
+    "rewards": ": set environment.reward_scale",
+}
 
 
 def first_component_violation(rollout: Rollout, spaces: Spaces, policy: PolicySpec) -> str:
@@ -61,6 +74,23 @@ def first_component_violation(rollout: Rollout, spaces: Spaces, policy: PolicySp
         if violation:
             return f"actions/{name} {violation}"
     return _log_prob_violation(rollout, spaces)
+
+
+def number_violation(rollout: Rollout) -> str:
+    """Return the first array with a value that is not finite or too large, or an empty string."""
+    for name, largest in _LARGEST.items():
+        array: np.ndarray = getattr(rollout, name)
+        if array.dtype.kind != "f" or not array.size:
+            continue
+        low, high = float(array.min()), float(array.max())  # nan if there is a nan
+        if not (math.isfinite(low) and math.isfinite(high)):
+            return f"{name} has a value that is not finite"
+        if max(-low, high) > largest:
+            return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
+    for name, values in rollout.episode_info.items():
+        if not (np.abs(values) <= LARGEST_EPISODE_NUMBER).all():
+            return f"episode_info {name!r} has a value that is not finite, or too large"
+    return ""
 
 
 def listed_names(names: Iterable[str]) -> str:

@@ -24,6 +24,7 @@ from daedalus.algorithms.normalization import (
     observations_name,
     one,
 )
+from daedalus.algorithms.replay_buffer import ReplayBuffer
 from daedalus.learner.run.counters import updates_of
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.training.update_graphs import UpdateGraphs, check_device, device_faults
@@ -200,6 +201,7 @@ class Learner:
         self._ranges, self._reward_name = ConfirmedRanges(), _REWARDS if self._rewards is None else _RETURNS
         self._reward_shares: dict[Rollout, float] = {}  # of the newest batch: with how much of their size they count
         self.far_outside: dict[Upload, str] = {}  # of the newest batch: what was left out, and its component
+        self.demonstrations: ReplayBuffer | None = None  # that are learned from; see learner/training/demonstrations.py
         self.first_pass: FirstPass | None = None  # of the newest batch, until its memory is used for the next one
         self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
         # Whether `step` returns before a GPU is done: not if what follows a batch changes how the next is sorted out.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.gradients import Terms, is_mixed
-from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions
+from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions, joined
 from daedalus.algorithms.sac import Sac, TwinCritics
 from daedalus.learner.run.process_resources import available_memory
 from daedalus.learner.run.settings import SettingsError
@@ -98,7 +98,7 @@ class ReplayLearner(Learner):
     def _update(self, progress: float) -> None:
         """Make one update, or skip it if a gradient is not finite."""
         spec = self._spec
-        transitions = self.replay.sample(spec.minibatch_rows, spec.n_step, spec.discount_factor)
+        transitions = self._sampled()
         gradients, terms = self._algorithm.gradients(_moved(transitions, self.device))
         norms = {name: float(torch.linalg.vector_norm(gradient)) for name, gradient in gradients.items()}
         self.policy_version += 1
@@ -113,6 +113,16 @@ class ReplayLearner(Learner):
         self._gradients.after_update(self.policy_version)
         self.metrics.add_update(Terms(*terms), rate.new_tensor(math.hypot(*norms.values())))
         self.metrics.count_updates(1)
+
+    def _sampled(self) -> Transitions:
+        """Return a minibatch, with its share of demonstrations: Ball et al. (2023), "Efficient Online Reinforcement
+        Learning with Offline Data", section 4.1."""
+        spec = self._spec
+        shown = 0 if self.demonstrations is None else round(spec.demonstration_share * spec.minibatch_rows)
+        sources = ((self.replay, spec.minibatch_rows - shown), (self.demonstrations, shown))
+        return joined(
+            [source.sample(count, spec.n_step, spec.discount_factor) for source, count in sources if source and count]
+        )
 
     def entropy_bonus(self, progress: float) -> float:
         """Return the weight of the entropy: the temperature, which is learned."""
@@ -129,7 +139,7 @@ class ReplayLearner(Learner):
 def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int) -> ReplayBuffer:
     """Return an empty buffer. Raises SettingsError, with how many transitions would fit, if it is too large."""
     capacity = min(spec.replay_transitions, spec.env_steps)
-    column = ReplayBuffer.bytes_of_column(spaces, rollout_length)
+    column = spaces.replay_bytes(rollout_length)
     columns = -(-capacity // rollout_length)
     if spec.replay_megabytes is not None:
         most, whose = int(spec.replay_megabytes * 2**20), "training.replay_megabytes allows"

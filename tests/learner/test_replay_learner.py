@@ -11,6 +11,8 @@ import pytest
 import torch
 from building import identity, make_rollout
 
+from daedalus.algorithms.replay_buffer import ReplayBuffer
+from daedalus.algorithms.sac import Sac
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training import replay_files
@@ -80,6 +82,20 @@ def test_updates_change_policy_critics_and_temperature() -> None:
         assert (learner.state()[f"algorithm/{name}"] != state[f"algorithm/{name}"]).any(), name
     assert learner.entropy_bonus(0.0) != 1.0
     assert learner.metrics.take_means()["gradient_norm"] > 0.0
+
+
+def test_half_of_each_minibatch_is_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
+    sampled: list[torch.Tensor] = []
+    gradients = Sac.gradients
+    monkeypatch.setattr(Sac, "gradients", lambda sac, batch: sampled.append(batch.rewards) or gradients(sac, batch))
+    learner = ReplayLearner(spec_of(), SPACES)
+    learner.demonstrations = ReplayBuffer(SPACES, 2 * ROWS, 32)  # whose rollouts may have another length
+    shown = rollout(1, 2 * ROWS)
+    shown.rewards[:] = 77.0
+    learner.demonstrations.add(shown)
+    trained(learner, 2, 3, 4)
+    assert len(sampled) == 16
+    assert all(len(rewards) == 8 and (rewards == 77.0).sum() == 4 for rewards in sampled)
 
 
 def test_a_rollout_that_is_not_finite_for_the_critics_is_survived() -> None:

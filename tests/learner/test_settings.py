@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from daedalus.launch.run_choice import RunChoice, warn_of_unread
 from daedalus.learner.run.run_directory import read_config, write_config
 from daedalus.learner.run.settings import (
     SettingsError,
@@ -18,6 +19,7 @@ from daedalus.learner.run.settings import (
     read_preset,
     read_settings,
     run_spec,
+    unread_settings,
 )
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
@@ -396,6 +398,44 @@ def test_sac_replaces_the_settings_of_another_algorithm_and_keeps_its_own() -> N
     settings["policy"]["hidden"] = [32]  # such as in the config.toml of a run
     choose_algorithm(settings, "sac")
     assert settings["policy"]["hidden"] == [32]
+
+
+@pytest.mark.parametrize(
+    ("settings", "unread", "read"),
+    [
+        ({}, "training.passes training.trace_clip policy.memory_units training.n_step", "training.trace_lambda"),
+        ({"training": {"algorithm": "appo"}}, "training.rho_clip training.target_rate", "training.passes"),
+        ({"training": {"algorithm": "appo", "exploration": [0.1]}}, "training.trace_clip", "training.rho_clip"),
+        ({"training": {"algorithm": "one_step_q"}}, "training.trace_lambda", "training.target_period"),
+        ({"training": {"optimizer": "rmsprop"}}, "policy.mixture_components", "training.rmsprop_decay"),
+        ({"policy": {"memory": "gru"}}, "policy.separate_value_encoder", "policy.memory_units"),
+        ({"training": {"algorithm": "my:Algorithm"}}, "", "training.passes training.n_step"),
+        (
+            {
+                "training": {"algorithm": "sac"},
+                "policy": {"distribution": "squashed_gaussian", "state_dependent_std": True},
+            },
+            "training.entropy_bonus training.passes policy.separate_value_encoder",
+            "training.n_step",
+        ),
+    ],
+)
+def test_settings_that_nothing_reads_are_known(settings: dict[str, Any], unread: str, read: str) -> None:
+    training = {"algorithm": "a3c", **settings.get("training", {})}
+    made = run_spec({"environment": {"id": "CartPole-v1"}, **settings, "training": training})
+    found = unread_settings(made)
+    assert set(unread.split()) <= found
+    assert not set(read.split()) & found
+    for name in found:  # all exist
+        section, key = name.split(".")
+        assert hasattr(getattr(made, section), key)
+
+
+def test_settings_of_the_user_that_nothing_reads_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    spec = RunChoice(env="CartPole-v1", algorithm="a2c").spec()
+    warn_of_unread(["training.clip_range=0.3"], {"training.passes": 2, "training.seed": 2}, spec)
+    warn_of_unread(["training.learning_rate=0.1"], {}, spec)
+    assert caplog.messages == ["no effect in this run (algorithm a2c): training.clip_range, training.passes"]
 
 
 @pytest.mark.parametrize("table", [3, {"impala": 3}, {"impala": {"training": 3}}])

@@ -1,0 +1,358 @@
+"""Minari datasets: recorded episodes of an environment, as numbers. Read with h5py, written with Minari's library.
+
+Minari's own reader makes the environment that the metadata name, where they name no spaces: it imports any module that
+the author of a dataset has chosen. This reader imports nothing, and reads arrays of numbers alone, whose sizes are
+checked before memory is allocated for them. h5py and minari are the extra `demonstrations`.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.environments.components import LeftOut, leaves, nested, without
+from daedalus.policy.saving.regular_files import read_regular
+from daedalus.protocol.texts import bounded_text
+
+if TYPE_CHECKING:
+    import h5py
+
+_METADATA_BYTES = 64 << 20  # the bounds of an image's pixels are listed one by one
+_EPISODE_BYTES = 1 << 30  # of one array of an episode
+_DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)) | {"bool"}
+_INSTALL = 'pip install "daedalus-rl[demonstrations]"'
+_ALGORITHM = "algorithm_name"  # of Minari's metadata
+
+
+class DatasetError(Exception):
+    """Error of a dataset that cannot be used. The message is one line."""
+
+
+class Episode(NamedTuple):
+    """One recorded episode of L steps. Values of a nested space have the first axis in each component."""
+
+    observations: Any  # [L+1, ...]; the last one follows the last action. None for components that are left out
+    actions: Any  # [L, ...]
+    rewards: np.ndarray  # [L] float64
+    terminated: bool  # by the environment, at the last step
+    truncated: bool  # by a limit
+
+
+def dataset_folder(name: str) -> Path:
+    """Return the folder of a dataset, which need not exist: `name` is a path, or an id of Minari's local datasets."""
+    if name.startswith((".", "/", "~")) or Path(name).is_dir():
+        return Path(name).expanduser().absolute()  # Minari joins the parts of others twice
+    _import_minari()
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    return Path(get_dataset_path(name))
+
+
+def _import_minari() -> None:
+    try:
+        import h5py  # noqa: F401  # minari works without
+        import minari  # noqa: F401
+    except ImportError as error:
+        raise DatasetError(
+            f"datasets of demonstrations need {error.name}, which is not installed: {_INSTALL}"
+        ) from None
+
+
+class MinariReader:
+    """A dataset that is open for reading: `with MinariReader(name) as dataset`."""
+
+    def __init__(self, name: str, leave_out: Sequence[str] = ()) -> None:
+        """Open a dataset and check the kinds and sizes of all its arrays, without reading them.
+
+        Args:
+          name: see dataset_folder.
+          leave_out: components of the observation that are not read.
+
+        Raises DatasetError, and EnvironmentSetupError if the observation has no such component.
+        """
+        self.name, folder = name, dataset_folder(name)
+        data = folder if (folder / "metadata.json").is_file() else folder / "data"
+        if not (data / "metadata.json").is_file():
+            raise DatasetError(
+                f"{name} is no Minari dataset: give a folder with data/metadata.json, or an id of `minari list local` "
+                "(`minari download ID` fetches a public one)"
+            )
+        _import_minari()
+        content = self._metadata(data / "metadata.json")
+        self.environment = _environment_id(content.get("env_spec"))
+        self.observation_space = without(self._space(content, "observation_space"), leave_out)
+        self.action_space = self._space(content, "action_space")
+        self._has_jpegs = content.get("jpeg_encoding", True) is not False
+        if content.get("data_format", "hdf5") != "hdf5":
+            shown = bounded_text(str(content["data_format"]), 40)
+            raise DatasetError(f"dataset {name} has the format {shown}, and only hdf5 is read: write it as hdf5")
+        import h5py
+
+        with self._faults():
+            self._file = h5py.File(data / "main_data.hdf5", "r")
+        try:
+            with self._faults():
+                self._lengths = [self._checked(group) for group in self._groups()]
+            stated = content.get("total_episodes")
+            if stated != len(self._lengths):
+                raise self._error(f"its metadata state {stated} episodes, and it has {len(self._lengths)}")
+            if not self._lengths:
+                raise self._error("it has no episodes")
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self._lengths)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of all episodes."""
+        return sum(self._lengths)
+
+    def __iter__(self) -> Iterator[Episode]:
+        """Yield the episodes in their order. Raises DatasetError."""
+        for number in range(len(self._lengths)):
+            with self._faults():
+                yield self._episode(number)
+
+    def _episode(self, number: int) -> Episode:
+        group: Any = self._file[f"episode_{number}"]
+        terminated, truncated = (np.asarray(group[name][()]).astype(bool) for name in ("terminations", "truncations"))
+        rewards = np.asarray(group["rewards"][()]).astype(np.float64)
+        if terminated[:-1].any() or truncated[:-1].any():
+            raise self._error(f"episode {number} goes on after a step that ends it")
+        if not np.isfinite(rewards).all():
+            raise self._error(f"episode {number} has a reward that is not finite")
+        return Episode(
+            observations=self._values(group["observations"], self.observation_space, "observation"),
+            actions=self._values(group["actions"], self.action_space, "action"),
+            rewards=rewards,
+            terminated=bool(terminated[-1]),
+            truncated=bool(truncated[-1]),
+        )
+
+    def _values(self, group: Any, space: gymnasium.Space, whole: str) -> Any:
+        parts: dict[tuple[str | int, ...], Any] = {}
+        for leaf in leaves(space, whole):
+            found = group
+            for key in () if isinstance(leaf.space, LeftOut) else leaf.path:
+                found = found[_key(key)]
+            parts[leaf.path] = None if isinstance(leaf.space, LeftOut) else found[()]
+        return nested(space, (), parts)
+
+    # -------------------------------------------------------------------------------------------- checks
+
+    def _groups(self) -> Iterator["h5py.Group"]:
+        for number in range(len(self._file)):
+            yield self._member(self._file, f"episode_{number}", is_group=True)
+
+    def _checked(self, group: "h5py.Group") -> int:
+        """Return the length of an episode. Raises DatasetError unless all its arrays are numbers of fitting shapes."""
+        rewards = self._member(group, "rewards")
+        steps = rewards.shape[0] if len(rewards.shape) == 1 else 0
+        if not steps:
+            raise self._error(f"{rewards.name} has the shape {rewards.shape}: it must have one number for each step")
+        for name in ("rewards", "terminations", "truncations"):
+            self._check_array(self._member(group, name), (steps,))
+        for name, space, rows in (
+            ("observations", self.observation_space, steps + 1),
+            ("actions", self.action_space, steps),
+        ):
+            for leaf in leaves(space, name):
+                if isinstance(leaf.space, LeftOut):
+                    continue
+                found = group
+                for key in (name, *map(_key, leaf.path[:-1])) if leaf.path else ():
+                    found = self._member(found, key, is_group=True)
+                found = self._member(found, _key(leaf.path[-1]) if leaf.path else name)
+                self._check_array(found, (rows, *(leaf.space.shape or ())), leaf.space)
+        return steps
+
+    def _member(self, group: Any, name: str, *, is_group: bool = False) -> Any:
+        """Return a part of the file that is in the file itself, and not a link to another."""
+        import h5py
+
+        link = group.get(name, getlink=True) if "/" not in name else None
+        if not isinstance(link, h5py.HardLink):
+            raise self._error(f"{group.name} has no {bounded_text(name, 64)} of its own")
+        found = group.get(name)
+        if not isinstance(found, h5py.Group if is_group else h5py.Dataset):
+            raise self._error(f"{found.name} is no {'group' if is_group else 'array'}")
+        return found
+
+    def _check_array(self, array: "h5py.Dataset", shape: tuple[int, ...], space: gymnasium.Space | None = None) -> None:
+        if self._has_jpegs and space is not None and _is_jpeg(space):
+            raise self._error(
+                f"{array.name} has its images as JPEG, which are not read: write the dataset with jpeg_encoding=False"
+            )
+        if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
+            raise self._error(f"{array.name} holds {array.dtype}, and only numbers are read")
+        if array.is_virtual or array.external:
+            raise self._error(f"{array.name} is in another file")
+        if array.shape != shape:
+            raise self._error(f"{array.name} has the shape {array.shape}, not {shape}")
+        size = max(math.prod(shape), math.prod(array.chunks or ())) * array.dtype.itemsize
+        if size > _EPISODE_BYTES:
+            raise self._error(f"{array.name} has {size:,} bytes: an episode may have {_EPISODE_BYTES:,}")
+
+    def _metadata(self, path: Path) -> dict[str, Any]:
+        try:
+            data = read_regular(path, _METADATA_BYTES + 1)
+            if len(data) > _METADATA_BYTES:
+                raise self._error(f"its metadata have more than {_METADATA_BYTES:,} bytes")
+            content = json.loads(data)
+        except (OSError, ValueError, RecursionError) as error:
+            raise self._error(f"its metadata cannot be read: {error}") from None
+        if not isinstance(content, dict):
+            raise self._error("its metadata are no table")
+        return content
+
+    def _space(self, content: Mapping[str, Any], name: str) -> gymnasium.Space:
+        from minari.serialization import deserialize_space
+
+        if not isinstance(content.get(name), str):
+            raise self._error(f"its metadata have no {name}: record it with a newer release of Minari")
+        try:
+            described = json.loads(content[name])
+            _check_space(described)
+            return deserialize_space(described)
+        except (
+            *(ValueError, TypeError, KeyError, AttributeError, AssertionError),
+            *(NotImplementedError, RecursionError, OverflowError),
+        ) as error:
+            raise self._error(f"its {name} cannot be read: {type(error).__name__}: {error}") from None
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError) as error:  # as h5py raises
+            raise self._error(f"it is damaged or no HDF5 file: {error}") from None
+
+    def _error(self, reason: str) -> DatasetError:
+        return DatasetError(bounded_text(f"dataset {self.name}: {reason}", 500))
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        self._file.close()
+
+    def __enter__(self) -> "MinariReader":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _key(key: str | int) -> str:
+    return f"_index_{key}" if isinstance(key, int) else key
+
+
+def _is_jpeg(space: gymnasium.Space) -> bool:
+    from minari.dataset.minari_storage import is_image_space
+
+    return is_image_space(space)
+
+
+def _check_space(described: Any) -> None:
+    """Raise ValueError for a space with other numbers than machines have, or with very many."""
+    if described.get("dtype", "int64") not in _DTYPES:
+        raise ValueError(f"dtype {bounded_text(str(described['dtype']), 40)}")
+    if math.prod(described.get("shape", ())) > _METADATA_BYTES:
+        raise ValueError("it is too large")
+    parts = described.get("subspaces", ())
+    for part in parts.values() if isinstance(parts, dict) else parts:
+        _check_space(part)
+
+
+def _environment_id(env_spec: Any) -> str:
+    """Return the id in the specification of an environment, as text; empty without any."""
+    try:
+        return bounded_text(str(json.loads(env_spec).get("id", "")), 200)
+    except (TypeError, ValueError, AttributeError, RecursionError):
+        return ""
+
+
+class MinariWriter:
+    """A new dataset. Each episode is on the disk when `add` returns: a recording that is cut short keeps the others."""
+
+    def __init__(
+        self,
+        name: str,
+        observation_space: gymnasium.Space,
+        action_space: gymnasium.Space,
+        env_spec: Any = None,
+        *,
+        algorithm: str = "",
+    ) -> None:
+        """Create the dataset.
+
+        Args:
+          name: see dataset_folder; an id needs a version, such as `cartpole/mine-v0`.
+          observation_space, action_space: of the environment that was played.
+          env_spec: gymnasium's specification of it (EnvSpec), which `minari` makes it from again; None: unknown.
+          algorithm: who played, for the metadata.
+
+        Raises DatasetError if it exists or cannot be written.
+        """
+        _import_minari()
+        from minari.dataset.minari_storage import MinariStorage
+
+        self.folder = dataset_folder(name)
+        self._name, self.episodes, self.steps = name, 0, 0
+        self._spaces = {"observations": observation_space, "actions": action_space}
+        if (self.folder / "data").exists():
+            raise DatasetError(f"dataset {name} exists at {self.folder}: choose another name, or remove it")
+        with self._faults():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._storage = MinariStorage.new(
+                self.folder / "data", observation_space, action_space, env_spec, jpeg_encoding=False
+            )
+            known = {_ALGORITHM: algorithm} if algorithm else {}
+            self._storage.update_metadata(
+                {"dataset_id": _dataset_id(name), "minari_version": metadata.version("minari"), **known}
+            )
+
+    def add(self, episode: Episode, seed: int | None = None) -> None:
+        """Write an episode. Raises DatasetError."""
+        from minari.data_collector import EpisodeBuffer
+
+        steps = len(episode.rewards)
+        ends = np.zeros((2, steps), np.bool_)
+        ends[:, -1] = episode.terminated, episode.truncated
+        buffer = EpisodeBuffer(
+            seed=seed,
+            observations=episode.observations,
+            actions=episode.actions,
+            rewards=[*episode.rewards],
+            terminations=[*ends[0]],
+            truncations=[*ends[1]],
+        )
+        with self._faults():
+            self._storage.update_episodes([buffer])
+        self.episodes, self.steps = self.episodes + 1, self.steps + steps
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError, NotImplementedError) as error:
+            raise DatasetError(f"dataset {self._name} cannot be written: {error}") from None
+
+
+def _dataset_id(name: str) -> str:
+    """Return an id that Minari accepts."""
+    kept = "".join(character if character.isalnum() or character in "-_/" else "-" for character in name).strip("-/")
+    last = kept.rpartition("-v")[2]
+    return kept if last.isdigit() else f"{kept or 'dataset'}-v0"

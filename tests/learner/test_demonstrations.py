@@ -1,0 +1,280 @@
+"""Minari datasets as demonstrations: every transition against the recorded episodes, and hostile datasets."""
+
+import json
+import logging
+import pickle
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import h5py
+import minari
+import numpy as np
+import pytest
+from minari.data_collector import EpisodeBuffer
+
+from daedalus.actor.environments.minari_files import Episode, MinariReader, MinariWriter
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.launch import demonstrations
+from daedalus.launch.demonstrations import write_demonstrations
+from daedalus.learner.run import demonstration_files
+from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.training.demonstrations import read_demonstrations
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+
+OBSERVATIONS = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+ACTIONS = gymnasium.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 1.0], np.float32))
+
+
+def spec_of(frames: int = 1, **training: Any) -> RunSpec:
+    return RunSpec.model_validate(
+        {
+            "environment": {"id": "Arm-v0", "frame_stack": frames, "reward_scale": 0.5},
+            "policy": {"hidden": (6,), "distribution": "squashed_gaussian", "state_dependent_std": True},
+            "training": {"algorithm": "sac", "replay_begin": 8, "minibatch_rows": 10, **training},
+        }
+    )
+
+
+def spaces_of(frames: int = 1) -> Spaces:
+    return Spaces(
+        observations={"observation": ArraySpace(shape=(2,), dtype="float32", frames=frames)},
+        actions={"action": ContinuousSpace(low=(-2.0, 0.0), high=(2.0, 1.0))},
+    )
+
+
+def episode(number: int, steps: int, *, terminated: bool, truncated: bool = False) -> Episode:
+    """Return an episode whose observations and rewards name their place."""
+    random = np.random.default_rng(number)
+    return Episode(
+        observations=np.array([[number, step] for step in range(steps + 1)], np.float64),
+        actions=random.uniform([-2.0, 0.0], [2.0, 1.0], (steps, 2)).astype(np.float32),
+        rewards=10.0 * number + np.arange(steps),
+        terminated=terminated,
+        truncated=truncated,
+    )
+
+
+EPISODES = [
+    episode(0, 5, terminated=True),
+    episode(1, 1, terminated=False, truncated=True),
+    episode(2, 9, terminated=False),  # the recording broke off
+    episode(3, 4, terminated=True, truncated=True),
+]
+
+
+@pytest.fixture
+def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Write a dataset with Minari's own library, and return its folder."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    buffers = [
+        EpisodeBuffer(
+            observations=each.observations,  # pyright: ignore[reportArgumentType]
+            actions=each.actions,  # pyright: ignore[reportArgumentType]
+            rewards=[*each.rewards],
+            terminations=[False] * (len(each.rewards) - 1) + [each.terminated],
+            truncations=[False] * (len(each.rewards) - 1) + [each.truncated],
+        )
+        for each in EPISODES
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it asks for authors and links
+        minari.create_dataset_from_buffers(
+            "arm/shown-v0", buffers, observation_space=OBSERVATIONS, action_space=ACTIONS
+        )
+    return tmp_path / "minari/arm/shown-v0"
+
+
+def expected(frames: int) -> list[tuple[list[float], list[float], list[float], float, float]]:
+    """Return each transition of the episodes: observation, action from -1 to 1, next observation, reward, discount."""
+    found = []
+    for each in EPISODES:
+        stacks = [
+            np.stack([each.observations[max(step - back, 0)] for back in range(frames - 1, -1, -1)]).ravel().tolist()
+            for step in range(len(each.observations))
+        ]
+        for step, reward in enumerate(each.rewards):
+            ends = step == len(each.rewards) - 1 and each.terminated
+            action = (each.actions[step] - [-2.0, 0.0]) / [4.0, 1.0] * 2.0 - 1.0
+            values = np.round(action, 4).tolist()
+            found.append((stacks[step], values, stacks[step + 1], 0.5 * reward, 0.0 if ends else 0.9))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("part_bytes", [1, 300, 16 << 20])
+@pytest.mark.parametrize("frames", [1, 3])
+def test_transitions_are_those_of_the_recorded_episodes(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frames: int, part_bytes: int
+) -> None:
+    for module in (demonstrations, demonstration_files):
+        monkeypatch.setattr(module, "PART_BYTES", part_bytes)  # also the length of rollouts
+    monkeypatch.setattr(demonstration_files, "MOST_ROWS", 4)
+    write_demonstrations("arm/shown-v0", spec_of(frames), spaces_of(frames), tmp_path)
+    buffer = read_demonstrations(tmp_path, spec_of(frames), spaces_of(frames), 0)
+    assert buffer is not None
+    found = buffer.transitions(buffer.learned_rows, 1, 0.9)
+    observations, following = (
+        values["observation"].flatten(1).tolist() for values in (found.observations, found.next_observations)
+    )
+    actions = np.round(found.actions.double().numpy(), 4).tolist()
+    rows = zip(observations, actions, following, found.rewards.tolist(), found.discounts.tolist(), strict=True)
+    for (*exact, discount), (*oracle, wanted) in zip(sorted(rows), expected(frames), strict=True):
+        assert exact == oracle
+        assert discount == pytest.approx(wanted)
+
+
+def test_minari_reads_what_is_recorded(tmp_path: Path) -> None:
+    environment = gymnasium.make("Pendulum-v1")
+    name = str(tmp_path / "pendulum/mine-v0")
+    writer = MinariWriter(name, environment.observation_space, environment.action_space, environment.spec)
+    first, _ = environment.reset(seed=1)
+    following, reward, *_ = environment.step(np.array([1.5], np.float32))
+    recorded = Episode(np.stack([first, following]), np.array([[1.5]], np.float32), np.array([reward]), False, True)
+    writer.add(recorded, seed=1)
+    theirs = minari.MinariDataset(Path(name) / "data")
+    assert (theirs.total_episodes, theirs.total_steps) == (1, 1)
+    assert theirs.recover_environment().spec == environment.spec
+    with MinariReader(name) as ours:
+        for found in (theirs[0], next(iter(ours))):
+            np.testing.assert_array_equal(found.observations, recorded.observations)
+            np.testing.assert_array_equal(found.actions, recorded.actions)
+            np.testing.assert_array_equal(found.rewards, recorded.rewards)
+
+
+def change(dataset: Path, kind: str) -> None:
+    """Damage a dataset."""
+    data, metadata = dataset / "data/main_data.hdf5", dataset / "data/metadata.json"
+    content = json.loads(metadata.read_text())
+    if kind == "truncated":
+        data.write_bytes(data.read_bytes()[:-2000])
+        return
+    if kind == "pickled":
+        data.write_bytes(pickle.dumps({"episodes": [1]}))
+        return
+    if kind == "pickled metadata":
+        metadata.write_bytes(pickle.dumps(content))
+        return
+    if kind == "no spaces":  # Minari's reader would make this environment, and import its module
+        del content["observation_space"]
+        content["env_spec"] = json.dumps({"id": "x:Evil-v0", "entry_point": "antigravity:Evil"})
+    if kind == "objects in a space":
+        content["action_space"] = json.dumps(json.loads(content["action_space"]) | {"dtype": "O"})
+    if kind == "episodes missing":
+        content["total_episodes"] += 1
+    metadata.write_text(json.dumps(content))
+    with h5py.File(data, "a") as file:
+        group: Any = file["episode_2"]
+        if kind == "outside":
+            group["actions"][3, 0] = 2.5
+        if kind == "nan":
+            group["observations"][1, 0] = np.nan
+        if kind == "lengths":
+            group["observations"].resize((7, 2))
+        if kind == "ends early":
+            group["terminations"][1] = True
+        if kind in ("objects", "link", "virtual", "huge"):
+            del group["rewards"]
+        if kind == "objects":
+            group.create_dataset("rewards", data=["a"] * 9, dtype=h5py.string_dtype())
+        if kind == "link":
+            group["rewards"] = h5py.ExternalLink("/etc/passwd", "/x")
+        if kind == "virtual":
+            layout = h5py.VirtualLayout((9,), "f8")
+            layout[:] = h5py.VirtualSource("/etc/passwd", "x", (9,))
+            group.create_virtual_dataset("rewards", layout)
+        if kind == "huge":
+            group.create_dataset("rewards", (1 << 40,), "f8", chunks=(1024,))
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [
+        ("truncated", "damaged or no HDF5 file"),
+        ("pickled", "damaged or no HDF5 file"),
+        ("pickled metadata", "metadata cannot be read"),
+        ("no spaces", "metadata have no observation_space"),
+        ("objects in a space", "dtype O"),
+        ("episodes missing", "state 5 episodes, and it has 4"),
+        ("outside", "episode 2: the action 2.5 is outside its bounds -2 to 2"),
+        ("nan", "episode 2: .* not finite"),
+        ("lengths", r"has the shape \(7, 2\), not \(10, 2\)"),
+        ("ends early", "episode 2 goes on after a step that ends it"),
+        ("objects", "holds object, and only numbers are read"),
+        ("link", "/episode_2 has no rewards of its own"),
+        ("virtual", "in another file"),
+        ("huge", "bytes: an episode may have"),
+    ],
+)
+def test_a_hostile_dataset_is_refused_in_one_line_and_nothing_is_left(
+    dataset: Path, tmp_path: Path, kind: str, reason: str
+) -> None:
+    change(dataset, kind)
+    run = tmp_path / "run"
+    run.mkdir()
+    with pytest.raises(SettingsError, match=reason) as refusal:
+        write_demonstrations(str(dataset), spec_of(), spaces_of(), run)
+    assert "\n" not in str(refusal.value)
+    assert len(str(refusal.value)) < 600
+    assert not [*run.iterdir()]
+
+
+def test_a_dataset_that_does_not_fit_the_run_or_the_memory_is_refused(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(SettingsError, match=r"float32 array of shape \(2,\);.*in the dataset, and .*3 stacked.*run"):
+        write_demonstrations("arm/shown-v0", spec_of(), spaces_of(3), tmp_path)
+    with pytest.raises(SettingsError, match="impala does not learn from demonstrations"):
+        write_demonstrations("arm/shown-v0", RunSpec.model_validate({"environment": {"id": "A-v0"}}), None, tmp_path)
+    with pytest.raises(SettingsError, match="nowhere is no Minari dataset"):
+        write_demonstrations("nowhere", spec_of(), None, tmp_path)
+    with caplog.at_level(logging.WARNING):
+        write_demonstrations("arm/shown-v0", spec_of(), None, tmp_path)
+    monkeypatch.setattr(demonstration_files, "available_memory", lambda: 3200)
+    with pytest.raises(SettingsError, match=r"19 steps take .* MiB .*: \d+ steps fit"):
+        read_demonstrations(tmp_path, spec_of(), spaces_of(), 0)
+    shutil.rmtree(tmp_path / "demonstrations/00000000")
+    with pytest.raises(Exception, match="a part is missing"):
+        read_demonstrations(tmp_path, spec_of(), spaces_of(), 0)
+
+
+NESTED = gymnasium.spaces.Dict(
+    {
+        "arm": gymnasium.spaces.Box(-1.0, np.inf, (2, 1), np.float32),
+        "grip": gymnasium.spaces.Discrete(3, start=5),
+        "rest": gymnasium.spaces.Tuple([gymnasium.spaces.MultiBinary(2), gymnasium.spaces.MultiDiscrete([2, 300])]),
+    }
+)
+TABLE = {"action_table": [[-1.0, 0.2], [1.0, 0.3]], "action_table_columns": [2, 0]}
+STEERED = gymnasium.spaces.Box(np.array([0.0, -3.0, -1.0]), np.array([1.0, 5.0, 1.0]), dtype=np.float64)
+
+
+@pytest.mark.parametrize(
+    ("space", "settings", "outside"),
+    [
+        (NESTED, {}, {"arm": np.zeros((2, 1)), "grip": 4, "rest": (np.zeros(2), np.zeros(2))}),
+        (STEERED, TABLE, np.array([0.2, 0.0, 1.0])),  # no row of the table
+        (STEERED, TABLE, np.array([0.2, 5.1, -1.0])),
+    ],
+)
+def test_recorded_actions_are_what_the_policy_would_have_chosen(
+    space: gymnasium.Space, settings: dict[str, Any], outside: Any
+) -> None:
+    environment = EnvironmentSpec.model_validate({"id": "Any-v0", **settings})
+    transforms = Transforms(environment, OBSERVATIONS, space)
+    random = np.random.default_rng(3)
+    chosen: dict[str, np.ndarray] = {}
+    for name, component in transforms.spaces.actions.items():
+        if isinstance(component, DiscreteSpace):
+            chosen[name] = random.integers(0, component.counts, (20, component.size)).astype(component.dtype)
+        else:
+            chosen[name] = random.uniform(-1.0, 1.0, (20, component.size)).astype(np.float32)
+    found = transforms.policy_actions(transforms.env_actions(chosen))
+    assert found.keys() == chosen.keys()
+    for name, values in chosen.items():
+        assert found[name].dtype == values.dtype
+        np.testing.assert_allclose(found[name], values, atol=1e-6)
+    with pytest.raises(ValueError, match="action"):
+        transforms.policy_action(outside)
