@@ -137,8 +137,9 @@ class GradientComputer:
             return self._differentiated(function(minibatch.with_tensors(parts), self.forward), bonus, then)
 
         changed = [self.parameters.gradients, *(() if then is None else then.changed)]
-        name = (function, then is None, *minibatch.names)
-        return self._recorder.call(name, update, [*minibatch.tensors(), bonus], changed)
+        # The spaces, and the number of rows and environments, decide the shapes of everything else.
+        name = (function, then is None, minibatch.shares.shape)
+        return self._recorder.call(name, update, [*minibatch.tensors(), bonus], changed, tells_shapes=True)
 
     def _differentiated(self, losses: Losses, bonus: Tensor, then: Then | None) -> tuple[Tensor, ...]:
         """Write the gradient [P] of the weighted sum of losses. Return their Terms."""

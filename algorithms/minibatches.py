@@ -33,11 +33,6 @@ class Minibatch:
     factors: Tensor  # [R, B], of the rows in the policy loss
     shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
 
-    @property
-    def names(self) -> tuple[tuple[str, ...], ...]:
-        """The names of the components of each map, in the order of the fields."""
-        return tuple(tuple(getattr(self, name)) for name in _MAPS)
-
     def tensors(self) -> list[Tensor]:
         """Return all tensors of the minibatch, in the order of the fields."""
         maps = (getattr(self, name).values() for name in _MAPS)

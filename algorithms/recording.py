@@ -197,7 +197,13 @@ class OperationRecorder:
         self._can_record = True
 
     def call(
-        self, name: Hashable, function: Function, tensors: Sequence[Tensor], changed: Sequence[Tensor] = ()
+        self,
+        name: Hashable,
+        function: Function,
+        tensors: Sequence[Tensor],
+        changed: Sequence[Tensor] = (),
+        *,
+        tells_shapes: bool = False,
     ) -> tuple[Tensor, ...]:
         """Return the results of a function, without gradients.
 
@@ -206,8 +212,9 @@ class OperationRecorder:
           function: it may compute gradients.
           tensors: its arguments.
           changed: other tensors that it changes in place, which it may use.
+          tells_shapes: whether the name differs for other shapes and types of tensors, so that they are not looked at.
         """
-        key = (name, *((each.shape, each.dtype) for each in tensors))
+        key = (name,) if tells_shapes else (name, *((each.shape, each.dtype) for each in tensors))
         recording = self._recordings.get(key)
         if recording is not None:
             return _repeated(recording, tensors)

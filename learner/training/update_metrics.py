@@ -39,7 +39,7 @@ class UpdateMetrics:
 
     def add_update(self, terms: Terms, norm: Tensor) -> None:
         """Add the metrics of an update: the terms of its loss and the norm of its gradient. Reads no value."""
-        self.update_sums.add_(torch.stack([*terms, norm, (norm > self._max_norm).to(norm.dtype)]))
+        self.update_sums.add_(torch.stack([*terms, norm, torch.gt(norm, self._max_norm, out=torch.empty_like(norm))]))
 
     def count_updates(self, number: int) -> None:
         """Count updates whose metrics were added."""

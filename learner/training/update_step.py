@@ -26,19 +26,22 @@ class UpdateStep:
         # Whether a gradient of the batch was not finite, 1 or 0, and the number of updates that were made of the batch.
         self._outcome = parameters.values.new_zeros(2)
         self._skips, self._made = self._outcome.unbind()
+        self._sound = parameters.values.new_zeros(())
         self._metrics_before = torch.zeros_like(metrics.update_sums)
-        self.changed: Sequence[Tensor] = [self._skips, self._made, metrics.update_sums]
+        self.changed: Sequence[Tensor] = [self._sound, self._skips, self._made, metrics.update_sums]
 
     def begin(self, learning_rate: float) -> None:
         """Begin with a batch, or with what is left of it."""
         self._rate.fill_(learning_rate)
         self._outcome.zero_()
+        self._sound.zero_()
         self._metrics_before.copy_(self._metrics.update_sums)
 
     def clip(self, terms: Terms) -> None:
         """Clip the gradient in place, and add the metrics of its update."""
         norm = self._parameters.clip_gradients(self._max_norm)
-        self._skips.logical_or_((norm - norm) != 0.0)  # the difference of an infinity, or nan, is nan
+        self._sound.addcmul_(norm, self._sound)  # 0 times an infinity, or nan, is nan: from then on it stays nan
+        torch.ne(self._sound, 0.0, out=self._skips)
         self._made.add_(1.0).sub_(self._skips)
         self._metrics.add_update(terms, norm)
 
