@@ -493,7 +493,12 @@ def test_with_a_gpu_versions_that_are_due_while_one_is_copied_are_left_out(netwo
     try:
         actors = with_fleet(network, server, 1)
         news: list[int] = []
-        inbox = actors.subscribe(keys.snapshots("r"), lambda: (news.append(version_of(inbox.take())), published.set()))
+
+        def receive() -> None:
+            news.append(version_of(inbox.take()))
+            published.set()
+
+        inbox = actors.subscribe(keys.snapshots("r"), receive)
         for version in (1, 2, 3):
             server.publisher.publish_if_due(version, lambda: slow, rollouts=1)
         assert server.publisher.version == 0
