@@ -14,6 +14,7 @@ import msgpack
 
 from daedalus.actor.collecting.client_seats import MatchSeat, match_seats
 from daedalus.protocol.lessons import Parameters
+from daedalus.protocol.releases import own_release
 
 ErrorCode = Literal[
     "malformed",  # not a message of this protocol
@@ -151,11 +152,18 @@ def read(data: str | bytes, states: Mapping[str, State]) -> ClientMessage:
 
 def _hello(message: dict[str, Any]) -> Hello:
     if message["version"] != VERSION:
-        raise ClientError("refused", f"the client uses version {_shown(message['version'])}, the gateway {VERSION}")
+        raise ClientError("refused", _other_version(message["version"]))
     name, token = message["name"], message.get("token", "")
     if not isinstance(name, str) or not isinstance(token, str):
         raise ClientError("malformed", "name and token must be text")
     return Hello(name, message["observations"], message["actions"], token, _match(message.get("match")))
+
+
+def _other_version(version: Any) -> str:
+    """Return which end to upgrade, where the client has another version of these messages."""
+    newer = type(version) is int and version > VERSION
+    remedy = "upgrade the gateway" if newer else f"use the client files of {own_release()}, in examples/gateway"
+    return f"the client uses version {_shown(version)}, the gateway {VERSION}, which {own_release()} has: {remedy}"
 
 
 def _match(value: Any) -> tuple[MatchSeat, ...]:
