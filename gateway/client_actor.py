@@ -39,7 +39,9 @@ class ClientActor:
         self._rows: ClientRows | None = None
         self._rows_epoch = -1  # of the learner that the rows are for
         self._full_version = -1  # of the last full rollout for that learner
-        self._override: Any = None  # the action that is played in the row that has begun, in place of the policy's
+        # The action that is played in the row that has begun, in place of the policy's: as it came, and as gymnasium
+        # has it.
+        self._override = self._played = None
 
     @property
     def name(self) -> str:
@@ -93,8 +95,7 @@ class ClientActor:
         """
         values = self.spaces.observation(message.observation)
         mask = self.spaces.action_mask(message.action_mask)
-        if message.override is not None:
-            self.spaces.check_action(message.override)
+        played = None if message.override is None else self.spaces.checked_action(message.override)
         self._check_reward(message.reward)
         epoch = current.session.learner_epoch
         # With the policy of another learner epoch the unfinished rollout for the previous one is dropped.
@@ -106,7 +107,7 @@ class ClientActor:
             raise ClientError("misfit", str(error)) from None
         if begins:
             self._rows, self._rows_epoch, self._full_version, self.version = rows, epoch, -1, current
-        self._on_action, self._override = on_action, message.override
+        self._on_action, self._override, self._played = on_action, message.override, played
 
     def _check_reward(self, value: float) -> None:
         if value and (self._rows is None or not self._rows.in_episode):
@@ -145,7 +146,7 @@ class ClientActor:
 
     def begin_row(self) -> RowInputs:
         """Return what the policy chooses from. Call `select_version` before."""
-        return self.rows.begin_row(overridden=self._override is not None, idle=self._awaits_update)
+        return self.rows.begin_row(override=self._played, idle=self._awaits_update)
 
     @property
     def _awaits_update(self) -> bool:

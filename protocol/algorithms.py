@@ -28,6 +28,9 @@ class ActorDemands(Specification):
     """Actors wait for each update; a batch is one rollout of every live actor (a barrier)."""
     next_action: bool = False
     """Targets need the action of the next row (Sarsa), so that a rollout has at least two rows."""
+    learns_overrides: bool = False
+    """Overridden rows are sent with the action that was played, also where a rollout has no other rows. An actor of an
+    older release does not know this field, and sends others."""
 
 
 class AlgorithmRecord(ActorDemands):
@@ -91,6 +94,7 @@ ALGORITHMS = {
         heads="policy",
         replay=True,
         demonstrations=True,
+        learns_overrides=True,
     ),
 }
 _OWN = re.compile(r"\w+(\.\w+)*:\w+")  # module:Class

@@ -36,6 +36,7 @@ _Part = TypeVar("_Part", bound=Specification)
 _MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcome, and the names of the settings
 
 
+_NOT_NEEDED = ("algorithm.learns_overrides",)  # an actor that does not know it plays its part without
 _ANY_LAG = 2**62  # more updates than any run makes
 _PAST_SHARE = 0.2  # of the matches, if it is not set
 _WITH_PARAMETERS = ("gymnasium", "fast")  # backends
@@ -362,7 +363,8 @@ class TrainingSpec(LossSpec):
     n_step: Annotated[int, Field(ge=1, le=64)] = 1
     """Rewards in the target of a transition before it bootstraps; fewer at the end of an episode or a rollout."""
     demonstration_share: UnitInterval = 0.5
-    """Share of each minibatch that comes from demonstrations, where the run has some (`--demonstrations`)."""
+    """Share of each minibatch that comes from demonstrations (`--demonstrations`) and from actions of people that
+    were played in place of the policy's, where there are any."""
     target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
     """Share of the way that the target critics move to the critics at each update."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
@@ -756,6 +758,7 @@ class RunSpec(Specification):
             max_upload_bytes=min(self.service.queue_bytes, 2**63 - 1),
         )
         changed = (*changed_fields(spec), *changed_fields(learning, "learning."))
+        changed = tuple(path for path in changed if path not in _NOT_NEEDED)
         return spec.model_copy(update={"learning": learning.model_dump(mode="json"), "changed": changed})
 
     @property

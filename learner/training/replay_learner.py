@@ -117,11 +117,15 @@ class ReplayLearner(Learner):
         """Return a minibatch, with its share of demonstrations: Ball et al. (2023), "Efficient Online Reinforcement
         Learning with Offline Data", section 4.1."""
         spec = self._spec
-        shown = 0 if self.demonstrations is None else round(spec.demonstration_share * spec.minibatch_rows)
-        sources = ((self.replay, spec.minibatch_rows - shown), (self.demonstrations, shown))
-        return joined(
-            [source.sample(count, spec.n_step, spec.discount_factor) for source, count in sources if source and count]
-        )
+        given, taught = len(self.demonstrations or ()), self.replay.taught
+        shown = round(spec.demonstration_share * spec.minibatch_rows) if given or taught else 0
+        if not len(self.replay):  # a person has done all so far
+            shown = spec.minibatch_rows
+        helped = int((torch.rand(shown) < taught / (given + taught)).sum()) if taught else 0
+        counts = {self.replay.sample: spec.minibatch_rows - shown, self.replay.sample_taught: helped}
+        if self.demonstrations is not None:
+            counts[self.demonstrations.sample] = shown - helped
+        return joined([draw(count, spec.n_step, spec.discount_factor) for draw, count in counts.items() if count])
 
     def entropy_bonus(self, progress: float) -> float:
         """Return the weight of the entropy: the temperature, which is learned."""
