@@ -129,7 +129,7 @@ class Recorder(gymnasium.Wrapper):
         Raises EnvironmentSetupError if there is no window or there are no keys, and DatasetError.
         """
         try:
-            from gymnasium.utils.play import play
+            from gymnasium.utils.play import MissingKeysToAction, play
         except (ImportError, gymnasium.error.DependencyNotInstalled):
             raise EnvironmentSetupError("the keyboard needs a window: pip install pygame-ce") from None
         import pygame
@@ -139,8 +139,8 @@ class Recorder(gymnasium.Wrapper):
             play(self, keys_to_action=actions, noop=self._of_space(idle), fps=rate)  # pyright: ignore[reportArgumentType]
         except _EnoughError:
             pass
-        except (pygame.error, ValueError, TypeError) as error:
-            raise EnvironmentSetupError(f"the keyboard cannot play: {error}; name keys with --key K=ACTION") from None
+        except (MissingKeysToAction, pygame.error, ValueError, TypeError) as error:
+            raise EnvironmentSetupError(f"the keyboard cannot play: {error}: name keys with --key K=ACTION") from None
         finally:
             pygame.quit()
 

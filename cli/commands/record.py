@@ -147,7 +147,8 @@ def _record(parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any) 
         player = PolicyPlayer(policy, sampled=parsed.sampled)
     else:
         spec, who = EnvironmentSpec(id=parsed.env), "a person" if by_keys else parsed.by
-        named = modules_of({"--env": parsed.env, "--by": parsed.by})  # the command line itself names them
+        # The command line itself names them.
+        named = modules_of({word: word for word in (parsed.env, parsed.by) if ":" in word})
         modules = UserModules(frozenset({*named, *parsed.allow_module}), "the command line")
     environment = recorded_environment(spec, modules, "rgb_array" if by_keys else None)
     try:
@@ -169,8 +170,7 @@ def _record(parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any) 
     returns = f"; return {np.mean(recorder.returns):g} +- {np.std(recorder.returns):g}" if recorder.returns else ""
     say(f"{writer.folder}: {writer.steps:,} steps in {writer.episodes:,} episodes{returns}", sys.__stdout__)
     if writer.episodes < parsed.episodes:
-        print_error(
-            "record", f"{'stopped' if stopped else 'ended'} after {writer.episodes} of {parsed.episodes} episodes"
-        )
+        how = "stopped" if stopped else "ended"
+        print_error("record", f"{how} after {writer.episodes} of {parsed.episodes} episodes")
         return 1
     return 0
