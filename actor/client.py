@@ -32,6 +32,7 @@ from daedalus.actor.errors import ActorError
 from daedalus.actor.session.actor_config import ActorConfig, LinkChoice, own_name
 from daedalus.actor.session.actor_service import ActorService
 from daedalus.protocol import keys
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.messages import MAX_ENVIRONMENTS, ClientReport
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import credentials_to_connect, run_for
@@ -220,6 +221,11 @@ class Client:
     def act(self, observation: Any, action_mask: Any = None, *, override: Any = None) -> Any:
         """See ClientAgent.act: this is the first agent."""
         return self.agents[0].act(observation, action_mask, override=override)
+
+    @property
+    def parameters(self) -> Parameters:
+        """See ClientAgent.parameters: this is the first agent."""
+        return self.agents[0].parameters
 
     def reward(self, value: float) -> None:
         """See ClientAgent.reward: this is the first agent."""

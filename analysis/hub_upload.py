@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.analysis.model_card import model_card
-from daedalus.analysis.recorded_run import SECONDS, RunRecord, one_run, read_record
+from daedalus.analysis.recorded_run import SECONDS, RunRecord, read_record
+from daedalus.analysis.run_selection import one_run
 from daedalus.learner.reporting.trackers.tracker import flat
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, METRICS, VERSIONS
 from daedalus.learner.run.run_files import RunDataError

@@ -9,7 +9,7 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from daedalus.analysis.run_selection import one_run
 from daedalus.learner.reporting.metrics_rows import MAX_COLUMNS, lasting
 from daedalus.learner.reporting.thinning import bounded, line_bytes
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, EVENTS, METRICS, OUTPUT, SUMMARY, VERSIONS
@@ -44,6 +45,10 @@ _MAX_METRICS_BYTES = 4 << 30  # a month of an earlier release, which did not mer
 _LONGEST_LINE = MAX_COLUMNS << 8  # bytes
 _MAX_OUTPUT_BYTES = 16 << 10
 _VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
+
+
+class NoMetricsError(RunDataError):
+    """Error for a run that has made no update yet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -180,38 +185,6 @@ class RecordedRun:
         return float(at[row]), float(self.metrics[SECONDS][row]) / 60.0
 
 
-def find_runs(paths: Iterable[Path]) -> list[Path]:
-    """Return the run directories that paths name. A folder of run directories, such as runs/, stands for all of them.
-
-    A run that has several paths is returned once, by the first of them. Raises RunDataError for a path that is neither.
-    """
-    found: list[Path] = []
-    for path in paths:
-        if (path / CONFIG).exists() or (path / METRICS).exists():
-            found.append(path)
-            continue
-        inside = sorted(config.parent for config in path.glob(f"*/{CONFIG}"))
-        if not inside:
-            raise RunDataError(
-                f"{path} is not a run directory: it has neither {CONFIG} nor {METRICS}; "
-                "name a run directory, or a folder of run directories"
-                if path.exists()
-                else f"{path} does not exist: name a run directory, or a folder of run directories"
-            )
-        found += inside
-    runs: dict[Path, Path] = {}
-    for path in found:  # links give a run further paths
-        runs.setdefault(path.resolve(), path)
-    return list(runs.values())
-
-
-def one_run(directory: Path) -> Path:
-    """Return a path that is a run directory. Raises RunDataError for any other path."""
-    if find_runs([directory]) != [directory]:
-        raise RunDataError(f"{directory} is a folder of run directories: name one of them")
-    return directory
-
-
 def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
     """Return the run in a directory; its metrics have at least env_steps, the return and `columns`.
 
@@ -219,7 +192,7 @@ def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
     """
     return RecordedRun(
         directory=directory,
-        settings=_settings(directory / CONFIG),
+        settings=read_run_settings(directory),
         metrics=_metrics(directory, (ENV_STEPS, RETURN, *columns)),
         summary=_summary(directory / SUMMARY),
     )
@@ -236,8 +209,9 @@ def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
     return dict(read_run(one_run(Path(directory))).metrics)
 
 
-def _settings(path: Path) -> dict[str, Any]:
-    settings = read_toml(path)
+def read_run_settings(directory: Path) -> dict[str, Any]:
+    """Return the settings of a run by `section.key`; empty without config.toml. Raises RunDataError."""
+    settings = read_toml(directory / CONFIG)
     if not settings:
         return {}
     try:
@@ -287,7 +261,7 @@ def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
             lines = csv.reader(_lines(path, file))
             header = next(lines, [])
             if not header:
-                raise RunDataError(nothing)
+                raise NoMetricsError(nothing)
             missing = [column for column in columns if column not in header]
             if missing:
                 raise RunDataError(
@@ -296,13 +270,13 @@ def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
             rows = ((line_bytes(row), _numbers(path, lines.line_num, row, len(header))) for row in lines)
             values = bounded(header, rows)
     except FileNotFoundError:
-        raise RunDataError(nothing) from None
+        raise NoMetricsError(nothing) from None
     except OSError as error:
         raise RunDataError(f"{path}: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise RunDataError(f"{path} is damaged: {error}") from None
     if not len(values):
-        raise RunDataError(nothing)
+        raise NoMetricsError(nothing)
     found = dict(zip(header, values.T, strict=True))
     kept = lasting(*(found[name] for name in (ENV_STEPS, SECONDS) if name in found))
     return {name: column[kept] for name, column in found.items()}

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from daedalus.analysis.recorded_run import ENVIRONMENT, SEED, RecordedRun, find_runs, read_run
+from daedalus.analysis.recorded_run import ENVIRONMENT, SEED, RecordedRun, read_run
+from daedalus.analysis.run_selection import find_runs
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.settings import value_text
 
@@ -174,7 +175,7 @@ def select(
     """Return the groups of the runs that paths name, of each environment, and one line for what is left out.
 
     Args:
-      parts: paths of run directories or of folders of them. One part is grouped by settings; several parts are groups.
+      parts: paths as `find_runs` takes them. One part is grouped by settings; several parts are groups.
       finished: leave out unfinished runs.
       columns: columns of the metrics that are needed.
       keys: settings that name the groups, if there is one part (default: those that differ).

@@ -36,6 +36,7 @@ after training:
   plot       draw the learning curves of one or more runs
   compare    print a table of groups of runs, with intervals
   report     write one HTML file about one or more runs
+  runs       keep runs in order: list, tag, best, archive, restore, prune
   export     write the policy of a run as one ONNX file, for use without Daedalus
   push       upload the policy of a run to the Hugging Face Hub
 
@@ -89,6 +90,7 @@ COMMANDS = {
     "plot": Command("commands.plot:parser", "commands.plot:plot"),
     "compare": Command("commands.compare:parser", "commands.compare:compare"),
     "report": Command("commands.report:parser", "commands.report:report"),
+    "runs": Command("commands.runs:parser", "commands.runs:runs"),
     "export": Command("commands.export:parser", "commands.export:export"),
     "push": Command("commands.push:parser", "commands.push:push"),
     "completion": Command("commands.completion:parser", "commands.completion:completion"),

@@ -20,6 +20,7 @@ from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.spec import ActorSpec
 
@@ -88,6 +89,15 @@ class ClientActor:
 
     # ---------------------------------------------------------------------------------------------- acting
 
+    def parameters(self, current: PolicyVersion) -> Parameters:
+        """Return the parameters of the episode that begins next. Raises ClientError."""
+        if self._begins(current):
+            self._begin(self._new_rows(current), current)
+        rows = self.rows
+        if rows.draws is not None and current.lessons is not None:
+            rows.draws.plan = current.lessons
+        return rows.parameters
+
     def observe(self, message: Act, current: PolicyVersion, on_action: Callable[[Any], None]) -> None:
         """Note an observation to act on, and what to call with the action.
 
@@ -97,17 +107,24 @@ class ClientActor:
         mask = self.spaces.action_mask(message.action_mask)
         played = None if message.override is None else self.spaces.checked_action(message.override)
         self._check_reward(message.reward)
-        epoch = current.session.learner_epoch
-        # With the policy of another learner epoch the unfinished rollout for the previous one is dropped.
-        begins = self._rows is None or (self._rows_epoch != epoch and self.epoch == epoch)
+        begins = self._begins(current)
         rows = self._new_rows(current) if begins else self.rows
         try:
             rows.observe(values, mask, 0.0 if begins else message.reward)
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
         if begins:
-            self._rows, self._rows_epoch, self._full_version, self.version = rows, epoch, -1, current
+            self._begin(rows, current)
         self._on_action, self._override, self._played = on_action, message.override, played
+
+    def _begins(self, current: PolicyVersion) -> bool:
+        """Whether rows for the learner epoch of a policy begin. The unfinished rollout of others is dropped."""
+        epoch = current.session.learner_epoch
+        return self._rows is None or (self._rows_epoch != epoch and self.epoch == epoch)
+
+    def _begin(self, rows: ClientRows, current: PolicyVersion) -> None:
+        self._rows, self._rows_epoch = rows, current.session.learner_epoch
+        self._full_version, self.version = -1, current
 
     def _check_reward(self, value: float) -> None:
         if value and (self._rows is None or not self._rows.in_episode):
@@ -118,7 +135,7 @@ class ClientActor:
         assert self._transforms is not None
         assert self._session is not None
         try:
-            return make_client_rows(
+            rows = make_client_rows(
                 current.session.spec,
                 self._transforms,
                 current.runtime,
@@ -130,6 +147,9 @@ class ClientActor:
             )
         except PolicyError as error:
             raise ClientError("refused", str(error)) from None
+        if self._rows is not None:
+            rows.take_over(self._rows)
+        return rows
 
     @property
     def rows(self) -> ClientRows:

@@ -25,6 +25,7 @@ from daedalus.gateway.joining import FollowedRun, Joining, Seat
 from daedalus.gateway.learner_link import LearnerLink, LinkSession, NewestPolicy
 from daedalus.gateway.policy_versions import PolicyVersion, PolicyVersions
 from daedalus.protocol import keys
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.messages import Join, Origin, Welcome
 from daedalus.transport.interface import Transport
 
@@ -250,6 +251,10 @@ class Gateway:
         actor.cut()
         if actor.epoch >= 0 and not actor.uploads.ended_by[0]:
             self._parked.park(actor)
+
+    def parameters(self, actor: ClientActor) -> Parameters:
+        """Return the parameters of the environment in a client's next episode. Raises ClientError."""
+        return actor.parameters(self._versions.current)
 
     def act(self, actor: ClientActor, message: Act, on_action: Callable[[Any], None]) -> None:
         """Choose a client's action, and call `on_action` with it, soon.

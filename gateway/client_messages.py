@@ -13,6 +13,8 @@ from typing import Any, Literal, NamedTuple
 import msgpack
 
 from daedalus.actor.collecting.client_seats import MatchSeat, match_seats
+from daedalus.protocol.lessons import Parameters
+from daedalus.protocol.releases import own_release
 
 ErrorCode = Literal[
     "malformed",  # not a message of this protocol
@@ -39,6 +41,7 @@ State = Literal["new", "ready", "acted"]
 # What a client may send in each state, and the state after the gateway's answer.
 TRANSITIONS: dict[tuple[State, str], State] = {
     ("new", "hello"): "ready",
+    ("ready", "parameters"): "ready",
     ("ready", "act"): "acted",
     ("acted", "act"): "acted",
     ("acted", "reward"): "acted",
@@ -47,7 +50,7 @@ TRANSITIONS: dict[tuple[State, str], State] = {
 _HINTS = {
     "new": "send a hello first",
     "ready": "send an act first: the episode has no action yet",
-    "acted": "a connection has one hello",
+    "acted": "a connection has one hello, and parameters are asked for before an episode",
 }
 
 
@@ -59,6 +62,12 @@ class Hello(NamedTuple):
     actions: Any
     token: str
     match: tuple[MatchSeat, ...] = ()  # the seats that the client holds; empty: it plays no match
+
+
+class AskParameters(NamedTuple):
+    """A client asks for the parameters of the environment in the episode that begins next."""
+
+    seat: str = ""
 
 
 class Act(NamedTuple):
@@ -87,10 +96,11 @@ class EndEpisode(NamedTuple):
     seat: str = ""
 
 
-ClientMessage = Hello | Act | Reward | EndEpisode
+ClientMessage = Hello | AskParameters | Act | Reward | EndEpisode
 
 _FIELDS: dict[str, tuple[set[str], set[str]]] = {  # required and optional fields of each type
     "hello": ({"version", "name", "observations", "actions"}, {"token", "match"}),
+    "parameters": (set(), {"seat"}),
     "act": ({"observation"}, {"action_mask", "reward", "override", "seat"}),
     "reward": ({"reward"}, {"seat"}),
     "end_episode": ({"terminated"}, {"observation", "reward", "seat"}),
@@ -124,6 +134,8 @@ def read(data: str | bytes, states: Mapping[str, State]) -> ClientMessage:
     if missing:
         raise ClientError("malformed", f"{kind} lacks the field {min(missing)!r}")
     match kind:
+        case "parameters":
+            return AskParameters(seat)
         case "act":
             reward = _number(message.get("reward", 0.0))
             return Act(message["observation"], message.get("action_mask"), reward, message.get("override"), seat)
@@ -140,11 +152,18 @@ def read(data: str | bytes, states: Mapping[str, State]) -> ClientMessage:
 
 def _hello(message: dict[str, Any]) -> Hello:
     if message["version"] != VERSION:
-        raise ClientError("refused", f"the client uses version {_shown(message['version'])}, the gateway {VERSION}")
+        raise ClientError("refused", _other_version(message["version"]))
     name, token = message["name"], message.get("token", "")
     if not isinstance(name, str) or not isinstance(token, str):
         raise ClientError("malformed", "name and token must be text")
     return Hello(name, message["observations"], message["actions"], token, _match(message.get("match")))
+
+
+def _other_version(version: Any) -> str:
+    """Return which end to upgrade, where the client has another version of these messages."""
+    newer = type(version) is int and version > VERSION
+    remedy = "upgrade the gateway" if newer else f"use the client files of {own_release()}, in examples/gateway"
+    return f"the client uses version {_shown(version)}, the gateway {VERSION}, which {own_release()} has: {remedy}"
 
 
 def _match(value: Any) -> tuple[MatchSeat, ...]:
@@ -207,6 +226,12 @@ def encode(message: dict[str, Any], *, as_text: bool) -> str | bytes:
 def welcome(run: str, environment: str, name: str) -> dict[str, Any]:
     """Return the answer to hello."""
     return {"type": "welcome", "version": VERSION, "run": run, "environment": environment, "name": name}
+
+
+def parameters(values: Parameters, seat: str = "") -> dict[str, Any]:
+    """Return the answer to parameters."""
+    message = {"type": "parameters", "parameters": dict(values)}
+    return {**message, "seat": seat} if seat else message
 
 
 def action(value: Any, seat: str = "") -> dict[str, Any]:

@@ -12,7 +12,16 @@ from daedalus.gateway import client_messages
 from daedalus.gateway.channel import channel_of
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_gateway import JOIN_SECONDS, Gateway
-from daedalus.gateway.client_messages import TRANSITIONS, Act, ClientError, EndEpisode, Hello, Reward, State
+from daedalus.gateway.client_messages import (
+    TRANSITIONS,
+    Act,
+    AskParameters,
+    ClientError,
+    EndEpisode,
+    Hello,
+    Reward,
+    State,
+)
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import MESSAGES_BURST, MESSAGES_PER_SECOND, Guard, RateLimit
 
@@ -47,7 +56,7 @@ class ClientConnection:
         self._gateway: Gateway | None = None  # while messages are answered
         self._actors: dict[str, ClientActor] = {}  # by seat
         self._unanswered: deque[str | bytes] = deque()
-        self._held: Act | Reward | EndEpisode | None = None  # read, of a seat that waits for its action
+        self._held: AskParameters | Act | Reward | EndEpisode | None = None  # read, of a seat that waits for its action
         self._waiting = set[str]()  # seats that wait for their actions
         self._is_paused = False  # by the rate limit
         self._rate = RateLimit()
@@ -192,13 +201,15 @@ class ClientConnection:
         else:
             self._answer(message)
 
-    def _answer(self, message: Act | Reward | EndEpisode) -> None:
+    def _answer(self, message: AskParameters | Act | Reward | EndEpisode) -> None:
         assert self._gateway is not None
         seat = message.seat
         actor = self._actors[seat]
         actor.heard_at = time.monotonic()
         try:
             match message:
+                case AskParameters():
+                    self._write(client_messages.parameters(self._gateway.parameters(actor), seat))
                 case Act():
                     self._gateway.act(actor, message, partial(self._on_action, seat))
                     self._waiting.add(seat)

@@ -208,6 +208,8 @@ class LearnerLink:
             runtime.load(snapshot.weights)
             self.newest_policy = NewestPolicy(session=session, program=program, snapshot=snapshot)
             size = max(sum(array.nbytes for array in snapshot.weights.values()), 1)
-            version = snapshot.policy_version
-            self._events.on_policy(PolicyVersion(session=session, version=version, runtime=runtime, size=size))
+            version, lessons = snapshot.policy_version, snapshot.lessons
+            self._events.on_policy(
+                PolicyVersion(session=session, version=version, runtime=runtime, size=size, lessons=lessons)
+            )
             snapshot = self._thread.run(self._session.next_snapshot(session, version))

@@ -4,6 +4,7 @@ import weakref
 from dataclasses import dataclass
 
 from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.messages import Welcome
 
 # Versions that are in use at the same time: at least so many, and as many as fit these bytes.
@@ -18,6 +19,7 @@ class PolicyVersion:
     version: int
     runtime: OnnxRuntime
     size: int  # of the weights, in bytes
+    lessons: LessonPlan | None  # in a run with lessons
 
 
 class PolicyVersions:

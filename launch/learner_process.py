@@ -294,9 +294,10 @@ class LearnerProcess:
 
     def _with_directory(self, run: ChosenRun, spaces: Spaces | None, stack: ExitStack) -> ChosenRun:
         """Create the directory of a new run, and return the run in it; `stack` unlocks it."""
-        lock = stack.enter_context(self._options.new.create(run.spec, run.directory, spaces))
+        lock, spec = self._options.new.create(run.spec, run.directory, spaces)
+        stack.enter_context(lock)
         self._context["run"] = run_directory.run_name(lock.directory)
-        return replace(run, directory=lock.directory)
+        return replace(run, spec=spec, directory=lock.directory)
 
     def _service(
         self,
@@ -349,6 +350,8 @@ class LearnerProcess:
         )
         join = how_to_join(self._options.network.addresses, self._credentials, spec)
         _logger.info("actors join with: %s", join)
+        if spec.environment.package is not None:
+            _logger.info("the environment is of the package %s, which actors need", spec.environment.package)
 
     def _start_trackers(self, directory: Path, output: ChildOutput, stack: ExitStack) -> None:
         """Start the chosen trackers and those that have logged the run before; `stack` ends them."""

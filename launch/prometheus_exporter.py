@@ -256,6 +256,9 @@ def metrics(statuses: Iterable[RunStatus], unread: Iterable[str] = ()) -> Iterat
     info = GaugeMetricFamily(
         "daedalus_run_info", "Environment and algorithm of the run.", labels=["run", "environment", "algorithm"]
     )
+    releases = GaugeMetricFamily(
+        "daedalus_release_processes", "Processes of the run by release.", labels=["run", "role", "software"]
+    )
     learners = GaugeMetricFamily("daedalus_learners", "Learners of the run that answer.", labels=["run"])
     actors = GaugeMetricFamily("daedalus_actors", "Actors by state.", labels=["run", "state"])
     rejected = CounterMetricFamily("daedalus_rollouts_rejected", "Rejected rollouts by cause.", labels=["run", "cause"])
@@ -267,11 +270,15 @@ def metrics(statuses: Iterable[RunStatus], unread: Iterable[str] = ()) -> Iterat
             wins.add_metric([run.run, opponent], rate)
         info.add_metric([run.run, run.environment, run.algorithm], 1)
         learners.add_metric([run.run], sum(status.run == run.run for status in statuses))
+        for software, counts in run.releases.items():
+            for role, count in zip(("learner", "actor"), counts, strict=True):
+                if count:
+                    releases.add_metric([run.run, role, software], count)
         for state, count in _states(run).items():
             actors.add_metric([run.run, state], count)
         for cause, count in sorted(run.rollouts_rejected.items()):
             rejected.add_metric([run.run, cause], count)
-    yield from (info, learners, actors, rejected, wins)
+    yield from (info, releases, learners, actors, rejected, wins)
     for kind, name, text, value_of in _OF_A_RUN:
         family = kind(f"daedalus_{name}", text, labels=["run"])
         for run in runs:

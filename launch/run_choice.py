@@ -150,12 +150,15 @@ class NewRun:
     other_spaces: bool = False  # accept `init_from` of other spaces
     demonstrations: str | None = None  # dataset to learn from, too
 
-    def create(self, spec: RunSpec, directory: Path, spaces: Spaces | None = None) -> RunLock:
-        """Create the run directory, with its demonstrations, and return its lock.
+    def create(self, spec: RunSpec, directory: Path, spaces: Spaces | None = None) -> tuple[RunLock, RunSpec]:
+        """Create the run directory, with its demonstrations. A default directory that is there gets a number.
 
-        A default directory that is there gets a number. `spaces` are those of the run, if they are known. Raises
-        SettingsError.
+        `spaces` are those of the run, if they are known. Return its lock, and the specification with the package of the
+        environment. Raises SettingsError.
         """
+        from daedalus.actor.environments.environment_packages import with_package  # only a new run needs it
+
+        spec = spec.model_copy(update={"environment": with_package(spec.environment)})
         lock = run_directory.create_locked(
             directory,
             spec,
@@ -172,7 +175,7 @@ class NewRun:
                 run_directory.remove_failed(lock.directory)
                 lock.close()
                 raise
-        return lock
+        return lock, spec
 
 
 def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Spaces | None]:
@@ -186,7 +189,7 @@ def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Sp
     check_initial(new.init_from, other_spaces=new.other_spaces)
     with Surroundings():  # which an algorithm of the user may change when it is imported
         spec, spaces = _prepared(new.choice, fork)
-    return new.create(spec, new.directory or new.choice.directory(spec), spaces), spec, spaces
+    return *new.create(spec, new.directory or new.choice.directory(spec), spaces), spaces
 
 
 def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:

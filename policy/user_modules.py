@@ -30,6 +30,10 @@ class UserModuleError(Exception):
     """Error of a module that is not allowed or cannot be imported. The message is one line and says what to do."""
 
 
+class MissingModuleError(UserModuleError):
+    """Error of a module that is not installed, or that imports one which is not."""
+
+
 class ModuleNotAllowedError(UserModuleError):
     """Error of settings that name modules which this process does not allow."""
 
@@ -79,7 +83,8 @@ class UserModules:
             with _imported(name), USER_STATE.undone():
                 return importlib.import_module(name)
         except ImportError as error:
-            raise UserModuleError(f"{setting}={value}: {_import_failure(name, error)}") from error
+            kind = MissingModuleError if isinstance(error, ModuleNotFoundError) else UserModuleError
+            raise kind(f"{setting}={value}: {_import_failure(name, error)}") from error
         except SystemExit as error:  # such as a script that reads its command line
             raise UserModuleError(
                 f"{setting}={value}: {name} ends the process when it is imported: "

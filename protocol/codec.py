@@ -33,6 +33,7 @@ from pydantic import BaseModel, ValidationError
 
 from daedalus.protocol.limits import LEARNER_LIMITS, Limits
 from daedalus.protocol.messages import CompactSnapshot, Message, Origin, Program
+from daedalus.protocol.releases import as_release, misfit
 from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import Gradient, Rollout
 
@@ -170,20 +171,19 @@ class ProtocolError(Exception):
 class VersionMismatchError(ProtocolError):
     """The message needs another version of the protocol."""
 
-    def __init__(self, theirs: int) -> None:
-        super().__init__(
-            f"the other end uses protocol version {theirs}, this one {PROTOCOL_VERSION}: "
-            "upgrade daedalus-rl at the end with the lower version"
-        )
+    def __init__(self, theirs: int, release: str = "") -> None:
+        """`theirs` is the version, and `release` what the sender states as its release, or empty."""
+        super().__init__(misfit(release, theirs, PROTOCOL_VERSION))
         self.theirs = theirs
 
 
 class UnfitMessageError(ProtocolError):
     """The message has this form, but a value of it does not fit this release."""
 
-    def __init__(self, kind: str, reason: str) -> None:
+    def __init__(self, kind: str, reason: str, release: str = "") -> None:
+        """`release` is what the sender states as its release, or empty."""
         super().__init__(f"{kind}: {reason}")
-        self.kind = kind
+        self.kind, self.release = kind, release
 
 
 def encode(message: Message) -> bytes:
@@ -228,7 +228,10 @@ def decode(data: bytes, limits: Limits) -> Message:
     Raises VersionMismatchError if this release cannot read its version, and ProtocolError if the bytes are not exactly
     one complete and consistent message within `limits`. No input raises any other exception.
     """
-    flags, header, body = _split(data, limits)
+    try:
+        flags, header, body = _split(data, limits)
+    except VersionMismatchError as error:
+        raise VersionMismatchError(error.theirs, _release_in(_fields_of(data, limits))) from None
     kind, fields, arrays, size = _read_header(header)
     if size > limits.max_bytes:
         raise ProtocolError(f"the body declares {size} bytes, the limit is {limits.max_bytes}")
@@ -240,9 +243,9 @@ def decode(data: bytes, limits: Limits) -> Message:
     try:
         message = unpack(_KINDS[kind], fields, "", buffers)
     except ValidationError as error:
-        raise UnfitMessageError(kind, _first_fault(error)) from None
+        raise UnfitMessageError(kind, _first_fault(error), _release_in(fields)) from None
     except ValueError as error:
-        raise UnfitMessageError(kind, str(error)) from None
+        raise UnfitMessageError(kind, str(error), _release_in(fields)) from None
     return message
 
 
@@ -252,11 +255,26 @@ def origin_of(data: bytes, limits: Limits) -> Origin:
     A learner names the host whose version it refuses. Versions before 6 have no origin.
     """
     try:
-        _, header, _ = _split(data, limits, any_version=True)
-        _, fields, _, _ = _read_header(header)
-        return unpack(Origin, dict(fields["origin"]), "", {})
-    except (ProtocolError, KeyError, TypeError, ValueError):
+        return unpack(Origin, dict(_fields_of(data, limits)["origin"]), "", {})
+    except (KeyError, TypeError, ValueError):
         return Origin()
+
+
+def _fields_of(data: bytes, limits: Limits) -> dict[str, Any]:
+    """Return the fields of a message of any protocol version, unchecked; none if they cannot be read."""
+    try:
+        _, header, _ = _split(data, limits, any_version=True)
+        return _read_header(header)[1]
+    except ProtocolError:
+        return {}
+
+
+def _release_in(fields: dict[str, Any]) -> str:
+    """Return the release that the sender of a message states, or an empty text."""
+    for stated in (fields, fields.get("origin"), fields.get("status")):
+        if isinstance(stated, dict) and (release := as_release(stated.get("software"))):
+            return release
+    return ""
 
 
 # ------------------------------------------------------------------------------------------- writing

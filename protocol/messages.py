@@ -7,6 +7,7 @@ messages, keys.py names the keys that they use, and the learner's intake decides
 import hashlib
 import math
 import secrets
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -273,6 +274,14 @@ class RunStatus(Specification):
     last_order: str = ""  # the newest order of an operator to this process, its author and time; empty without one
     league: LeagueStatus | None = None  # of a game with opponents, bounded (LeagueStatus.bounded)
     lessons: dict[str, str] = Field(default_factory=dict)  # by parameter: what is played now, for a person
+    software: str = ""  # release of the learner, such as `daedalus-rl 1.2.3`
+
+    @property
+    def releases(self) -> dict[str, tuple[int, int]]:
+        """By release: how many learners (0 or 1) and actors that are present have it. Empty text: it is not known."""
+        actors = Counter(actor.software for actor in self.actors if actor.alive)
+        names = dict.fromkeys([self.software, *sorted(actors)])
+        return {name: (int(name == self.software), actors[name]) for name in names}
 
     @property
     def fleet_size(self) -> int:
@@ -319,6 +328,7 @@ class Welcome:
     learner_epoch: int  # identifies this process of the learner; rollouts for another epoch are fenced
     seed: int  # for the environments and samples of this incarnation of the actor
     spec: ActorSpec
+    software: str = ""  # release of the learner, such as `daedalus-rl 1.2.3`
     epsilon: float = 0.0  # probability with which this actor takes a random action in the end; 0: it does not explore
     # For an evaluator: episodes to play at once with each policy, with this seed; 0: as the specification says.
     play_episodes: int = 0
@@ -343,6 +353,7 @@ class Refusal:
         "mismatch", "malformed", "not_ready", "unknown", "finished", "drained", "full", "name_taken", "failed"
     ]
     reason: str
+    software: str = ""  # release of the learner, where it refuses another one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

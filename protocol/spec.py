@@ -24,6 +24,7 @@ from daedalus.protocol.models import (
     changed_fields,
     has_field,
 )
+from daedalus.protocol.releases import REPLACED_SETTINGS
 from daedalus.protocol.spaces import ComponentName
 from daedalus.protocol.texts import bounded_text, exact_number
 
@@ -36,11 +37,22 @@ _Part = TypeVar("_Part", bound=Specification)
 _MAX_BYTES = LEARNER_LIMITS.max_header_bytes - (8 << 10)  # the rest of a Welcome, and the names of the settings
 
 
-_NOT_NEEDED = ("algorithm.learns_overrides",)  # an actor that does not know it plays its part without
 _ANY_LAG = 2**62  # more updates than any run makes
 _PAST_SHARE = 0.2  # of the matches, if it is not set
 _WITH_PARAMETERS = ("gymnasium", "fast")  # backends
 FROM_PYTHON = "python:"  # beginning of the id of an environment that only the program has which started the run
+
+
+# A requirement that may stand in a command: name, extras and version, without characters of any shell.
+_REQUIREMENT = r"^[A-Za-z0-9][A-Za-z0-9._-]*(\[[A-Za-z0-9._-]+(,[A-Za-z0-9._-]+)*\])?==[0-9][A-Za-z0-9.+_-]*$"
+_MOST_REQUIREMENT = 100  # characters
+# Settings that tell people something, or that ask for more than an actor needs: one that does not know them plays on.
+_NOT_NEEDED = frozenset({"environment.package", "algorithm.learns_overrides"})
+
+
+def is_requirement(text: str) -> bool:
+    """Return whether a text has the form `name==version` or `name[extra]==version`, as `environment.package`."""
+    return len(text) <= _MOST_REQUIREMENT and re.fullmatch(_REQUIREMENT[1:-1], text) is not None
 
 
 def _check_environment_id(value: str) -> str:
@@ -62,6 +74,10 @@ class EnvironmentSpec(Specification):
     """Environment to play: a gymnasium id, `module:Id` or `module:Class` for your own, or the backend's own name.
     `python:NAME` is an object that a Python program gave to `daedalus.train`, and that no module has. A game with
     several agents: its module, such as `pettingzoo.classic.connect_four_v3`, or `module:function` for your own."""
+    package: Annotated[str, Field(pattern=_REQUIREMENT, max_length=_MOST_REQUIREMENT)] | None = None
+    """Python package that has the environment, as `name==version` or `name[extra]==version`: what an actor without it
+    names in its error, and an actor with another version in a warning. It is never installed. Unset: recorded when the
+    run starts, if an installed package of the module's name has the environment."""
     backend: Backend = "gymnasium"
     """Implementation of the environment. `fast` is gymnasium's CarRacing-v3 with a cheaper renderer; `pettingzoo` plays
     games with several agents, and is chosen for its modules."""
@@ -566,6 +582,11 @@ class ActorSpec(Specification):
 
 def _refuse_unknown(paths: list[str], model: type[Specification]) -> None:
     unknown = [path for path in paths if not has_field(model, path)]
+    for path in unknown:
+        if replacement := REPLACED_SETTINGS.get(path):
+            raise UnsupportedRunError(
+                f"the run sets {path}, which {replacement} replaces in this release: upgrade daedalus-rl at the learner"
+            )
     if unknown:
         names = bounded_text(", ".join(unknown[:3]), 150)
         raise UnsupportedRunError(
@@ -757,8 +778,8 @@ class RunSpec(Specification):
             seed=self.training.seed,
             max_upload_bytes=min(self.service.queue_bytes, 2**63 - 1),
         )
-        changed = (*changed_fields(spec), *changed_fields(learning, "learning."))
-        changed = tuple(path for path in changed if path not in _NOT_NEEDED)
+        of_actors = [path for path in changed_fields(spec) if path not in _NOT_NEEDED]
+        changed = (*of_actors, *changed_fields(learning, "learning."))
         return spec.model_copy(update={"learning": learning.model_dump(mode="json"), "changed": changed})
 
     @property

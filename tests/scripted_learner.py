@@ -16,6 +16,7 @@ from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
@@ -72,6 +73,7 @@ class ScriptedLearner:
         self.newer: tuple[str, ...] = ()  # settings that the run changes and this release does not know
         self.epsilons: dict[str, float] = {}  # by actor; 0 of the others
         self.extras: dict[str, np.ndarray] = {}  # in snapshots, besides the weights
+        self.lessons: LessonPlan | None = None  # in snapshots
         self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
         self.compact_fetches: list[SnapshotRequest] = []
         self._compact = CompactSnapshotCache(epoch)
@@ -120,7 +122,13 @@ class ScriptedLearner:
         weights = {name: parameter.detach().numpy() for name, parameter in self.policy.network.named_parameters()}
         name = program_hash(self.policy.model)
         self.snapshot = encode(
-            Snapshot(learner_epoch=self.epoch, policy_version=version, program=name, weights=weights | self.extras)
+            Snapshot(
+                learner_epoch=self.epoch,
+                policy_version=version,
+                program=name,
+                weights=weights | self.extras,
+                lessons=self.lessons,
+            )
         )
         if push:
             self.transport.publish(keys.snapshots(self.run), self.snapshot)

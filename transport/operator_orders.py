@@ -9,6 +9,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import Acknowledgement, Order, OrderRequest, Refusal, RunStatus
+from daedalus.protocol.releases import own_release
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, MAX_NAME, bounded_text
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport
@@ -55,7 +56,10 @@ class Operator:
         for answer in messages:
             raise OrderError(bounded_text(answer.reason, MAX_ANSWER_TEXT))
         rights = "" if self.name == keys.NO_OPERATOR else ", or the router does not let this certificate order it"
-        raise OrderError(f"the learner of run {status.run!r} does not answer the order: it is busy or gone{rights}")
+        release = "" if status.software == own_release() else f", or another release than {own_release()}: use its own"
+        raise OrderError(
+            f"the learner of run {status.run!r} does not answer the order: it is busy or gone{rights}{release}"
+        )
 
     def drain_waiting(self, transport: Transport, actor: str, incarnation: int) -> None:
         """Ask an actor that waits for a run to leave. Without an answer: its presence ends. Raises TransportError."""

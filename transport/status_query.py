@@ -94,7 +94,8 @@ def _remedy(key: str, error: ProtocolError) -> str:
         case VersionMismatchError():
             return f"its learner is of another release; {error}"
         case UnfitMessageError():
-            return f"its learner is of another release ({error}): ask with the release of daedalus-rl that it has"
+            release = error.release or "the release of daedalus-rl that it has"
+            return f"its learner is of another release ({error}): ask with {release}"
         case _:
             return f"what answers for its learner is not one ({error}): find out which process serves {key}"
 

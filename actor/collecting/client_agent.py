@@ -11,6 +11,7 @@ from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.client_seats import MatchSeat
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.precision import Precision
+from daedalus.protocol.lessons import Parameters
 
 _logger = logging.getLogger(__name__)
 
@@ -95,6 +96,20 @@ class ClientAgent:
             return self._guard.action(observation)
         return rows.env_action(actions)
 
+    @property
+    def parameters(self) -> Parameters:
+        """The parameters of the environment, by name, of the running episode or else of the one that begins next.
+
+        Those of `environment.parameters` in the run, as its lessons vary them. Empty in a run without parameters; in
+        one with them, read it before the first `act` of each episode. Raises what has ended the client's thread.
+        """
+        self._check()
+        self._switch_policy()
+        assert self._rows is not None  # a Client waits for the first policy
+        if self._rows.is_between_rollouts:
+            self._load_newest(self._rows)
+        return dict(self._rows.parameters)
+
     def reward(self, value: float) -> None:
         """Add `value` to the reward of the last action; any number of times until the next `act`.
 
@@ -143,15 +158,18 @@ class ClientAgent:
             return
         if self._rows is not None and not self._rows.is_between_rollouts:
             self._exchange.drop()
+        before = self._rows
         self._rows, self._loaded = begun
-        self._rows.use(self._loaded.runtime)
+        self._rows.use(self._loaded.runtime, self._loaded.lessons)
+        if before is not None:
+            self._rows.take_over(before)
 
     def _load_newest(self, rows: ClientRows) -> None:
         """Let the newest weights act."""
         newest = self._exchange.newest_policy(self._index)
         if newest is not None and newest is not self._loaded:
             self._loaded = newest
-            rows.use(newest.runtime)
+            rows.use(newest.runtime, newest.lessons)
 
     def _policy_may_act(self) -> bool:
         """Return whether the policy may act now, and not the safe action."""

@@ -17,6 +17,7 @@ from daedalus.actor.environments.components import without
 from daedalus.actor.environments.info import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
@@ -62,6 +63,7 @@ class ClientCollector:
         self.on_rollout: Callable[[], None] = lambda: None  # called on the caller's thread when a rollout is full
         self._transforms: Transforms | None = None  # of the run that is being joined
         self._program: OnnxRuntime | None = None
+        self._plan: LessonPlan | None = None  # the newest, in a run with lessons
         self._exchange = ClientExchange(agents)
         self.agents = tuple(ClientAgent(index, self._exchange, self.guard, check) for index in range(agents))
         for first in range(0, agents if seats else 0, max(len(seats), 1)):
@@ -92,6 +94,7 @@ class ClientCollector:
         """See Collector. Discard the rollouts of the previous policy."""
         assert isinstance(runtime, OnnxRuntime)  # a client has no other
         self._program = runtime
+        self._plan = None
         rows = [self._rows(agent, spec, (seed, index), epsilon) for index, agent in enumerate(self.agents)]
         self._exchange.begin(rows, together=spec.algorithm.synchronous)
 
@@ -119,7 +122,8 @@ class ClientCollector:
         assert self._program is not None
         runtime = self._program.fork()
         runtime.load(snapshot.weights)
-        self._exchange.offer(LoadedPolicy(snapshot.policy_version, runtime))
+        self._plan = snapshot.lessons or self._plan
+        self._exchange.offer(LoadedPolicy(snapshot.policy_version, runtime, self._plan))
 
     def confirm(self, at: float) -> None:
         """See Collector."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.uploads import Rollout
 
 
@@ -36,6 +37,7 @@ def side_by_side(rollouts: Sequence[Rollout]) -> Rollout:
         valid=np.concatenate([each.valid for each in rollouts], axis=1),
         episode_returns=np.concatenate([each.episode_returns for each in rollouts]),
         episode_lengths=np.concatenate([each.episode_lengths for each in rollouts]),
+        lessons=_episodes_joined([each.lessons for each in rollouts]),
         overridden=_flags([each.overridden for each in rollouts], first.valid),
         taught=_flags([each.taught for each in rollouts], first.valid),
         game_steps=None if first.game_steps is None else sum(each.env_steps for each in rollouts),
@@ -46,6 +48,12 @@ def _flags(parts: Sequence[np.ndarray | None], like: np.ndarray) -> np.ndarray |
     if all(part is None for part in parts):
         return None
     return np.concatenate([np.zeros_like(like) if part is None else part for part in parts], axis=1)
+
+
+def _episodes_joined(lessons: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the parameters of the episodes of all rollouts; one without an episode has none."""
+    played = [each for each in lessons if each]
+    return {name: np.concatenate([each[name] for each in played]) for name in (played[0] if played else ())}
 
 
 def _joined(arrays: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -61,6 +69,7 @@ class LoadedPolicy:
 
     version: int
     runtime: OnnxRuntime
+    lessons: LessonPlan | None = None  # in a run with lessons
 
 
 class ClientExchange:

@@ -9,12 +9,14 @@ from typing import Any, Literal
 import numpy as np
 
 from daedalus.actor.collecting.client_seats import MatchSeat
+from daedalus.actor.collecting.episode_lessons import LessonDraws
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.components import numbered
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.environments.vector_environments import Observed
 from daedalus.actor.errors import ActorError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
+from daedalus.protocol.lessons import LessonPlan, Parameters
 from daedalus.protocol.spec import ActorSpec, EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
@@ -43,6 +45,7 @@ class ClientRows:
         seat: MatchSeat | None = None,
         agent_ids: bool = False,
         learns_overrides: bool = False,
+        draws: LessonDraws | None = None,
     ) -> None:
         """Construct the rows.
 
@@ -55,7 +58,11 @@ class ClientRows:
           seat: of a match whose seats the loop hosts; None: of none.
           agent_ids: whether the policy observes the number of the seat.
           learns_overrides: whether the learner learns from the actions that are played in place of the policy's.
+          draws: of the parameters of the loop's environment; None: the run has none.
         """
+        self.draws = draws
+        self._drawn: Parameters | None = None  # of the next episode, if somebody has asked for them
+        self._playing: Parameters = {}  # of the episode of the last action
         self.seat, self._is_numbered = seat, agent_ids and seat is not None
         self._transforms, self._writer, self._has_masks = transforms, writer, example_mask is not None
         self._bootstrap_terminations = bootstrap_terminations
@@ -83,16 +90,40 @@ class ClientRows:
         """Whether the next row is the first of a rollout: only then may another policy version choose."""
         return self._writer.is_between_rollouts
 
-    def use(self, runtime: PolicyRuntime) -> None:
-        """Let a runtime with other weights choose the actions. Call only between rollouts."""
+    @property
+    def parameters(self) -> Parameters:
+        """The parameters of the running episode, or those that the next one is to be played with."""
+        if self.in_episode or self.draws is None:
+            return self._playing
+        if self._drawn is None:
+            self._drawn = self.draws.draw()
+        return self._drawn
+
+    def take_over(self, rows: "ClientRows") -> None:
+        """Go on with the parameters of rows under another learner, whose episode may be running."""
+        known = rows._drawn or rows._playing
+        if self.draws is not None and known.keys() == self.draws.true_task.keys():
+            self._drawn = known
+
+    def use(self, runtime: PolicyRuntime, plan: LessonPlan | None = None) -> None:
+        """Let a runtime with other weights choose the actions, and episodes begin by a plan. Only between rollouts."""
         self._writer.use(runtime)
+        if self.draws is not None and plan is not None:
+            self.draws.plan = plan
 
     def observe(self, observation: Any, action_mask: Any = None, reward: float = 0.0) -> None:
         """Note an observation to act on, which the last action, or the last episode's end, led to.
 
         Adds `reward`, if there is one, to the reward of the last action. Raises ValueError if the observation, the mask
-        or the reward does not fit; nothing has changed then.
+        or the reward does not fit, or an episode begins whose parameters nobody has asked for; nothing has changed
+        then.
         """
+        if self.draws is not None and self._drawn is None and not self.in_episode:
+            names = ", ".join(self.draws.true_task)
+            raise ValueError(
+                f"this run sets parameters of the environment ({names}): ask for `parameters` before the first act "
+                "of each episode, and play with them"
+            )
         if action_mask is None and self._has_masks:
             raise ValueError("this client was constructed with an action_mask: pass one to every act()")
         if action_mask is not None and not self._has_masks:
@@ -160,6 +191,9 @@ class ClientRows:
             self._record(self._last)
             return False
         self._acted = True
+        if self.draws is not None and self._drawn is not None:
+            self._playing, self._drawn = self._drawn, None
+            self._writer.play(0, self.draws.with_lessons(self._playing))
         if self._overridden:
             self._writer.override(self._played)
         if self.seat is not None and self.seat.steps is not None:
@@ -279,17 +313,12 @@ def check_run(spec: ActorSpec) -> None:
         raise ActorError(
             "this run takes gradients (collection.upload), and a client sends rollouts: set collection.upload=rollouts"
         )
-    if spec.lessons:
-        raise ActorError(
-            f"this run has lessons for {', '.join(sorted(spec.lessons))}, and a client's own loop makes its "
-            "environment: start the run without lessons, or play the environment with daedalus actor"
-        )
     _refuse_unapplied_settings(spec.environment)
 
 
 def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
     """Raise ActorError for settings about stepping and wrapping environments: here the loop belongs to the caller."""
-    defaults = {"wrap": None, "action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None, "parameters": {}}
+    defaults = {"wrap": None, "action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None}
     changed = [
         f"environment.{name}={getattr(spec, name)}"
         for name, default in defaults.items()
@@ -341,4 +370,5 @@ def make_client_rows(
         seat=seat,
         agent_ids=spec.environment.agent_ids,
         learns_overrides=spec.algorithm.learns_overrides,
+        draws=LessonDraws(spec, random) if spec.environment.parameters else None,
     )

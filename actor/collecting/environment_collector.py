@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from daedalus.actor.collecting.episode_lessons import EpisodeLessons, LessonDraws, try_extremes
+from daedalus.actor.collecting.episode_lessons import LessonDraws, try_extremes
 from daedalus.actor.collecting.lineup import Lineup, rating_copies
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, SeatWriter
 from daedalus.actor.environments.bots import make_bot
@@ -17,6 +17,7 @@ from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.environments.vector_environments import Observed, VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
@@ -49,7 +50,7 @@ class EnvironmentCollector:
         self._requested: object = None  # what the environments were made for: a backend may make fewer of them
         self._runtime: PolicyRuntime | None = None
         self._writer: RolloutWriter | None = None
-        self._lessons: EpisodeLessons | None = None
+        self._draws: LessonDraws | None = None  # in a run with lessons
         self._reset: Callable[[], Observed] | None = None  # begins the first episodes, once there is a snapshot
         self._policy_version = -1
 
@@ -117,12 +118,9 @@ class EnvironmentCollector:
             random=np.random.default_rng(action_seed),
             epsilon=epsilon,
         )
-        self._lessons = None
-        if spec.lessons:
-            draws = LessonDraws(spec, np.random.default_rng([*action_seed, 2]))
-            self._lessons = EpisodeLessons(environments.count, spec, draws, environments.set_parameters)
+        self._draws = LessonDraws(spec, np.random.default_rng([*action_seed, 2])) if spec.lessons else None
         reset = partial(environments.reset, environment_seed % (_SEEDS - environments.count))
-        if self._lessons is None:
+        if self._draws is None:
             self._writer.start(reset())
         else:
             self._reset = reset  # until the first snapshot has the lessons
@@ -133,16 +131,23 @@ class EnvironmentCollector:
         assert self._writer is not None
         self._runtime.load(snapshot.weights)
         self._policy_version = snapshot.policy_version
-        if self._lessons is not None and snapshot.lessons is not None:
-            self._lessons.draws.plan = snapshot.lessons
+        if self._draws is not None and snapshot.lessons is not None:
+            self._draws.plan = snapshot.lessons
         if self._reset is not None:
-            self._begin_episodes()
+            self._begin_episodes(np.ones_like(self._writer.resets))
             self._writer.start(self._reset())
             self._reset = None
 
-    def _begin_episodes(self) -> None:
-        if self._lessons is not None:
-            self._lessons.begin_due()
+    def _begin_episodes(self, due: np.ndarray) -> None:
+        """Draw the parameters of the episodes, [E] bool, that the next reset or step begins."""
+        if self._draws is None or not np.count_nonzero(due):
+            return
+        assert self._writer is not None
+        assert self._environments is not None
+        drawn: dict[int, Parameters] = {index: self._draws.draw() for index in np.flatnonzero(due).tolist()}
+        for index, parameters in drawn.items():
+            self._writer.play(index, self._draws.with_lessons(parameters))
+        self._environments.set_parameters(drawn)
 
     def confirm(self, at: float) -> None:
         """See Collector. Has no effect: the policy acts whatever its age."""
@@ -155,17 +160,14 @@ class EnvironmentCollector:
         is_full = False
         while not is_full:
             on_row()
-            self._begin_episodes()
+            self._begin_episodes(writer.resets)
             observed, rewards, terminated, truncated = environments.step(writer.act())
             is_full = writer.record(observed, rewards, terminated, truncated)
-            if self._lessons is not None:
-                self._lessons.end(terminated | truncated)
-        lessons = {} if self._lessons is None else self._lessons.take_finished()
-        return writer.finish(identity, self._policy_version, environments.take_episode_info(), lessons)
+        return writer.finish(identity, self._policy_version, environments.take_episode_info())
 
     def close(self) -> None:
         """See Collector. Close the environments."""
         if self._environments is not None:
             self._environments.close()
         self._environments = self._requested = self._runtime = self._writer = self.lineup = None
-        self._lessons = self._reset = None
+        self._draws = self._reset = None

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from daedalus.actor.collecting.episode_lessons import lesson_arrays
 from daedalus.actor.collecting.lineup import Lineup
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.vector_environments import Observed
@@ -13,6 +14,7 @@ from daedalus.policy.acting.noise import Noise, draw_noise
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -28,12 +30,19 @@ class FinishedEpisodes:
 
     returns: np.ndarray  # [K] float64, undiscounted and unscaled
     lengths: np.ndarray  # [K] int32, env_steps
+    parameters: list[Parameters]  # of each, those that have a lesson; empty in a run without parameters
 
 
 class EpisodeCounter:
-    """The running returns and lengths of E environments' episodes, and those of the episodes that ended."""
+    """The running returns and lengths of E environments' episodes, and those of the episodes that ended.
+
+    Attributes:
+      parameters: of the running episodes, those that have a lesson, by environment; empty in a run without parameters.
+    """
 
     def __init__(self, count: int) -> None:
+        self.parameters: list[Parameters] = []
+        self._played: list[Parameters] = []  # by the episodes that ended
         self._returns = np.zeros(count, np.float64)
         self._lengths = np.zeros(count, np.int32)
         self.ended = np.zeros(count, np.bool_)  # [E] whether the next step is the reset after an episode's end
@@ -46,6 +55,8 @@ class EpisodeCounter:
         self.ended = ended
         if np.count_nonzero(self.ended):
             self._finished.append((self._returns[self.ended], self._lengths[self.ended]))
+            if self.parameters:
+                self._played += [self.parameters[index] for index in np.flatnonzero(self.ended).tolist()]
             self._returns[self.ended] = 0.0
             self._lengths[self.ended] = 0
 
@@ -72,6 +83,7 @@ class EpisodeCounter:
     def cut(self) -> None:
         """Note that all episodes ended with the row that was counted last."""
         self._finished.append((self._returns.copy(), self._lengths.copy()))
+        self._played += self.parameters
         self.restart()
         self.ended[:] = True
 
@@ -84,10 +96,12 @@ class EpisodeCounter:
     def take_finished(self) -> FinishedEpisodes:
         """Return the episodes that ended since the last call."""
         finished, self._finished = self._finished, []
+        played, self._played = self._played, []
         returns, lengths = zip(*finished, strict=True) if finished else ((), ())
         return FinishedEpisodes(
             returns=np.concatenate([np.zeros(0), *returns]),
             lengths=np.concatenate([np.zeros(0, np.int32), *lengths]),
+            parameters=played,
         )
 
 
@@ -185,6 +199,17 @@ class RolloutWriter:
         """Let another runtime of the same program choose the actions. Call only between rollouts."""
         self._runtime = runtime
 
+    @property
+    def resets(self) -> np.ndarray:
+        """Of which environments the next row is the reset after an episode's end, [E] bool."""
+        return self._episodes.ended
+
+    def play(self, index: int, parameters: Parameters) -> None:
+        """Note the parameters with lessons of an environment's next episode. Call it before the row of its reset."""
+        if not self._episodes.parameters:
+            self._episodes.parameters = [{}] * self._count
+        self._episodes.parameters[index] = parameters
+
     def start(self, observed: Observed) -> None:
         """Begin with the first observations of all environments."""
         self._stacks.push(observed.frames, np.ones(self._count, np.bool_))
@@ -277,12 +302,10 @@ class RolloutWriter:
         identity: RolloutIdentity,
         policy_version: int,
         episode_info: dict[str, np.ndarray] | None = None,
-        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
         """Return the full rollout. Its arrays are views: encode or copy it before the next `act`.
 
-        `episode_info` is that of the environments (VectorEnvironment.take_episode_info), and `lessons` are the
-        parameters of the episodes that ended (EpisodeLessons.take_finished).
+        `episode_info` is that of the environments (VectorEnvironment.take_episode_info).
         """
         self._row = 0
         make_learnable(self._spec, self._rewards, self._terminated, self._truncated)
@@ -303,7 +326,7 @@ class RolloutWriter:
             episode_returns=finished.returns[-self._rewards.size :],
             episode_lengths=finished.lengths[-self._rewards.size :],
             episode_info=episode_info or {},
-            lessons=lessons or {},
+            lessons=lesson_arrays(finished.parameters[-self._rewards.size :]),
             overridden=self._overridden if self._overridden.any() else None,
             taught=self._taught if self._taught.any() else None,
         )
@@ -461,10 +484,9 @@ class SeatWriter(RolloutWriter):
         identity: RolloutIdentity,
         policy_version: int,
         episode_info: dict[str, np.ndarray] | None = None,
-        lessons: dict[str, np.ndarray] | None = None,
     ) -> Rollout:
-        """See RolloutWriter. No game has lessons."""
-        rollout = super().finish(identity, policy_version, episode_info, lessons)
+        """See RolloutWriter."""
+        rollout = super().finish(identity, policy_version, episode_info)
         if not self._warned and self._skipped > self._rewards.size:
             self._warned = True
             _logger.warning(

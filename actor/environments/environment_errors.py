@@ -11,7 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from pydantic import ValidationError
 
 from daedalus.policy.user_code import first_line, frames_of, is_of_user, place_of, print_traceback
-from daedalus.policy.user_modules import USER_STATE, file_of, hidden_file
+from daedalus.policy.user_modules import USER_STATE, MissingModuleError, UserModuleError, file_of, hidden_file
 
 _FLATTEN = ", or make one array of them: --wrap gymnasium.wrappers:FlattenObservation"
 OTHER_BACKEND = "or use another backend (--set environment.backend=gymnasium)"
@@ -22,6 +22,16 @@ _CLOSE = 0.7  # similarity of two names that could be meant for each other
 
 class EnvironmentSetupError(Exception):
     """The environment cannot be created or stepped; the message says why and what to do."""
+
+
+class MissingPackageError(EnvironmentSetupError):
+    """A package or module of the environment is not here; the message names it."""
+
+
+def of_module(error: UserModuleError) -> EnvironmentSetupError:
+    """Return the error of an environment whose module cannot be imported."""
+    kind = MissingPackageError if isinstance(error, MissingModuleError) else EnvironmentSetupError
+    return kind(str(error))
 
 
 def reason_of(error: ValidationError) -> str:
@@ -89,7 +99,7 @@ def import_extra(module: str, extra: str, purpose: str, otherwise: str = "") -> 
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise EnvironmentSetupError(
+        raise MissingPackageError(
             f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]"'
             f"{', ' if otherwise else ''}{otherwise}"
         ) from None
@@ -119,7 +129,7 @@ def creation_errors(environment: str, hint: str = "") -> Iterator[None]:
     except gymnasium.error.DependencyNotInstalled as error:
         extra = next((extra for extra in ("box2d", "mujoco") if extra in str(error).lower()), None)
         remedy = first_line(error) if extra is None else f'pip install "daedalus-rl[{extra}]"'
-        raise EnvironmentSetupError(
+        raise MissingPackageError(
             f"environment {environment} needs a package that is not installed: {remedy}"
         ) from None
     except (Exception, SystemExit) as error:  # broad: the constructor of a user's environment may raise anything

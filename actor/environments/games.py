@@ -19,10 +19,12 @@ from daedalus.actor.environments.bots import Bot, LegalActions
 from daedalus.actor.environments.components import dtype_misfit, leaves, numbered, with_agent, without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
+    MissingPackageError,
     creation_errors,
     described,
     hint_of_count,
     import_extra,
+    of_module,
     playing_error,
 )
 from daedalus.actor.environments.game_copies import GameCopy, Outcome, game_copy, without_checks
@@ -408,7 +410,7 @@ def _make(spec: EnvironmentSpec, modules: UserModules, **options: Any) -> Any:
         try:
             make = modules.attribute("environment.id", spec.id)
         except UserModuleError as error:
-            raise EnvironmentSetupError(str(error)) from error
+            raise of_module(error) from error
     else:
         module = _module(module_name)
         make = getattr(module, "parallel_env", None) or getattr(module, "env", None)
@@ -440,7 +442,7 @@ def _module(name: str) -> Any:
             raise EnvironmentSetupError(f"unknown game {name!r}: {first_line(error)}") from None
         group = name.split(".")[1]  # such as classic: PettingZoo has an extra of that name for what its games need
         remedy = f'pip install "pettingzoo[{group}]"' if package == "pettingzoo" else "install it"
-        raise EnvironmentSetupError(
+        raise MissingPackageError(
             f"environment {name} needs a package that is not installed ({error.name}): {remedy}"
         ) from None
 

@@ -17,8 +17,10 @@ from daedalus.actor.environments.environment_errors import (
     creation_errors,
     import_extra,
     not_registered,
+    of_module,
     unknown_to_gymnasium,
 )
+from daedalus.actor.environments.environment_packages import REGISTERING
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.given_environment import Maker, given_environment
 from daedalus.actor.environments.gymnasium_environments import EnvironmentsInTurn, GymnasiumEnvironments
@@ -30,8 +32,6 @@ from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules, object_of
 from daedalus.protocol.spec import FROM_PYTHON, EnvironmentSpec
 
-# Packages that register environments when they are imported: beginning of the id -> module and extra.
-_PACKAGES = {"ALE/": ("ale_py", "atari"), "MiniGrid-": ("minigrid", "minigrid"), "BabyAI-": ("minigrid", "minigrid")}
 _OLD_ATARI = ("-v0", "-v4")  # versions of Atari's games under names without ALE/, such as PongNoFrameskip-v4
 # Arguments of the constructor that change an Atari game, by the same names on all backends. ALE's own has no modes.
 _ATARI_GAME_KWARGS = (
@@ -193,9 +193,9 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
         try:
             own = modules.load("environment.id", environment_id)
         except UserModuleError as error:
-            raise EnvironmentSetupError(str(error)) from error
+            raise of_module(error) from error
     else:
-        for beginning, (module, extra) in _PACKAGES.items():
+        for beginning, (module, extra) in REGISTERING.items():
             if name.startswith(beginning):
                 gymnasium.register_envs(import_extra(module, extra, f"environment {name}"))
         if name.endswith(_OLD_ATARI) and name not in gymnasium.registry:
@@ -293,7 +293,7 @@ def _wrapped(environment: gymnasium.Env, wrap: str, modules: UserModules) -> gym
     try:
         function = modules.attribute("environment.wrap", wrap)
     except UserModuleError as error:
-        raise EnvironmentSetupError(str(error)) from error
+        raise of_module(error) from error
     if not callable(function):
         raise EnvironmentSetupError(f"environment.wrap={wrap} is not a function: name it as module:function")
     wrapped = function(environment)

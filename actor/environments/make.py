@@ -1,11 +1,16 @@
 """Creates environments from their specification."""
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+import logging
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, MissingPackageError
+from daedalus.actor.environments.environment_packages import absent, how_to_bring, other_version
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.environments.vector_environments import BackendEnvironments, VectorEnvironment
 from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
+
+_logger = logging.getLogger(__name__)
 
 
 def make_environments(
@@ -37,14 +42,19 @@ def make_environments(
     try:
         modules.check(spec.user_modules)
     except UserModuleError as error:
-        raise EnvironmentSetupError(str(error)) from None
+        raise EnvironmentSetupError(f"{error}{absent(spec)}") from None
     if camera is not None and (count != 1 or render_mode != "rgb_array"):
         raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
     if spec.backend != "gymnasium" and not spec.is_game:
         asked = {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera}
         asked["environment.parameters"] = spec.parameters or None if spec.backend != "fast" else None
         _refuse_gymnasium_options(spec, asked)
-    bare, rest = make_bare(spec, count, modules, render_mode, camera, one_episode)
+    if warning := other_version(spec):
+        _logger.warning("%s", warning)
+    try:
+        bare, rest = make_bare(spec, count, modules, render_mode, camera, one_episode)
+    except MissingPackageError as error:
+        raise EnvironmentSetupError(f"{error}{how_to_bring(spec)}") from error
     try:
         return TransformedEnvironment(bare, rest, one_episode=one_episode)
     except EnvironmentSetupError:

@@ -1,6 +1,5 @@
 """What an actor decides for itself: its settings, its name, where it runs. Everything else comes from the learner."""
 
-import importlib.metadata
 import os
 import re
 import socket
@@ -10,6 +9,7 @@ from typing import Literal
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Origin
+from daedalus.protocol.releases import own_release
 from daedalus.protocol.texts import MAX_NAME
 from daedalus.transport.interface import Transport
 
@@ -52,13 +52,6 @@ def own_name(identity: str = "", number: int = 1) -> str:
     return f"{first}{host[: max(MAX_NAME - len(first) - len(last), 0)]}{last}"
 
 
-_DISTRIBUTION = "daedalus-rl"
-
-
 def own_origin(transport: Transport) -> Origin:
     """Return the name of this host, the version of this software and the address of this end of the connection."""
-    try:
-        version = importlib.metadata.version(_DISTRIBUTION)
-    except importlib.metadata.PackageNotFoundError:  # the source code without an installation
-        version = "unknown"
-    return Origin(host=socket.gethostname(), software=f"{_DISTRIBUTION} {version}", address=transport.local_address)
+    return Origin(host=socket.gethostname(), software=own_release(), address=transport.local_address)

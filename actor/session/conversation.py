@@ -35,6 +35,7 @@ from daedalus.protocol.messages import (
     Welcome,
     starts_of,
 )
+from daedalus.protocol.releases import as_release, own_release
 from daedalus.protocol.spec import UnsupportedRunError
 from daedalus.protocol.texts import MAX_ANSWER_TEXT, MAX_NAME, bounded_text
 
@@ -421,7 +422,7 @@ class Conversation:
         try:
             welcome.spec.check_known()
         except UnsupportedRunError as error:
-            failure = ActorError(str(error))
+            failure = ActorError(_with_release(error, welcome.software))
             yield from self._report_failure(welcome.run, join, failure)
             raise failure from None
 
@@ -482,11 +483,18 @@ class Conversation:
             raise ActorError(str(error)) from None
         except ProtocolError as error:
             if isinstance(error, UnfitMessageError) and error.kind == Welcome.__name__:
-                raise ActorError(
+                reason = (
                     f"this release cannot play the run ({error}): upgrade daedalus-rl here to the learner's release"
-                ) from None
+                )
+                raise ActorError(_with_release(reason, error.release)) from None
             _logger.warning("ignored a damaged message: %s", error)
             return None
+
+
+def _with_release(reason: object, learner: str) -> str:
+    """Return why a run cannot be played, with the release of its learner, if it states one, and of this process."""
+    release = as_release(learner)
+    return f"{reason} ({release}; this process has {own_release()})" if release else str(reason)
 
 
 def _awaited(run: str, there: list[str]) -> str:

@@ -24,6 +24,7 @@ examples:
   daedalus compare runs
   daedalus compare runs/cartpole-* --threshold 400
   daedalus compare runs/old-* -- runs/new-*
+  daedalus compare runs@old -- runs@new          (tags, of `daedalus runs tag`)
   daedalus compare sweeps/cartpole-rollout_length --csv table.csv
 
 The statistics are those of Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the Statistical
@@ -37,7 +38,13 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus compare`."""
     options = command_parser("compare", _DESCRIPTION, _EXAMPLES)
     options.usage = "daedalus compare [-h] [--threshold RETURN] [--csv FILE] RUN_DIR... [-- RUN_DIR...]"
-    options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to compare")
+    options.add_argument(
+        "directories",
+        nargs="+",
+        type=Path,
+        metavar="RUN_DIR",
+        help="runs to compare; FOLDER@TAG: those in a folder that have a tag (daedalus runs)",
+    )
     options.add_argument(
         "--threshold",
         type=float,

@@ -38,7 +38,13 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus plot`."""
     options = command_parser("plot", _DESCRIPTION, _EXAMPLES)
     options.usage = "daedalus plot [-h] --output FILE [--by env_steps|minutes] [--profile] RUN_DIR... [-- RUN_DIR...]"
-    options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw")
+    options.add_argument(
+        "directories",
+        nargs="+",
+        type=Path,
+        metavar="RUN_DIR",
+        help="runs to draw; FOLDER@TAG: those in a folder that have a tag (daedalus runs)",
+    )
     options.add_argument(
         "--output", type=_picture, required=True, metavar="FILE", help="picture to write: .png, .svg or .pdf"
     )

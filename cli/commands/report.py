@@ -38,7 +38,13 @@ def parser() -> argparse.ArgumentParser:
     options.usage = (
         "daedalus report [-h] [--output FILE] [--by env_steps|minutes] [--threshold RETURN] RUN_DIR... [-- RUN_DIR...]"
     )
-    options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to report")
+    options.add_argument(
+        "directories",
+        nargs="+",
+        type=Path,
+        metavar="RUN_DIR",
+        help="runs to report; FOLDER@TAG: those in a folder that have a tag (daedalus runs)",
+    )
     options.add_argument(
         "--output",
         type=Path,

@@ -9,13 +9,15 @@ from functools import partial
 from pathlib import Path
 from textwrap import TextWrapper
 
+from daedalus.analysis.run_selection import find_runs
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.run_watcher import looks
 from daedalus.cli.screen import Screen
 from daedalus.launch.logs import print_error, say
 from daedalus.launch.process_lifecycle import status_at_start
 from daedalus.learner.run.heartbeat import HEARTBEAT, silence
-from daedalus.learner.run.run_directory import CONFIG
+from daedalus.learner.run.run_directory import CONFIG, run_name
+from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
@@ -45,6 +47,7 @@ examples:
   daedalus status --connect tcp/gpu-box:7447 --json
   daedalus status --connect tcp/gpu-box:7447 --events
   daedalus status --connect tcp/gpu-box:7447 --watch
+  daedalus status --connect tcp/127.0.0.1:7447 --run runs@paper
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
@@ -70,7 +73,12 @@ def parser() -> argparse.ArgumentParser:
         help="check only that the learner of this run directory works: it renewed its heartbeat file within the last "
         "two minutes. Needs no network and no router. For a liveness probe",
     )
-    options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="show only this run")
+    options.add_argument(
+        "--run",
+        default=keys.ANY_RUN,
+        metavar="NAME",
+        help="show only this run; FOLDER@TAG: only the runs whose directories in FOLDER of this machine have the tag",
+    )
     options.add_argument(
         "--events",
         action="store_true",
@@ -98,6 +106,13 @@ def status(arguments: list[str]) -> int:
     if parsed.alive is not None:
         return _check_alive(parsed.alive)
     try:
+        tagged = _tagged(parsed.run)
+    except RunDataError as error:
+        print_error("status", error)
+        return NO_ANSWER
+    if tagged is not None:
+        parsed.run = keys.ANY_RUN
+    try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
         parsed.run = run_for(credentials, parsed.run)
     except SECURITY_ERRORS as error:
@@ -105,13 +120,15 @@ def status(arguments: list[str]) -> int:
         return status_at_start(error)
     try:
         if parsed.watch:
-            return _watch(parsed, credentials)
+            return _watch(parsed, credentials, tagged)
         transport = connect_once(parsed.connect, credentials)
         try:
             found = survey(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
-            statuses = found.statuses
+            statuses = [status for status in found.statuses if tagged is None or status.run in tagged]
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
             unanswered = "" if statuses or found.unread else no_answer(transport, parsed.run)
+            if found.statuses and not statuses:
+                unanswered = f"no learner of a run with this tag answers; they are {', '.join(sorted(tagged or ()))}"
             waiting = list(waiting_actors(transport))
         finally:
             transport.close()
@@ -134,17 +151,28 @@ def status(arguments: list[str]) -> int:
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
 
 
-def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
+def _tagged(run: str) -> set[str] | None:
+    """Return the names of the runs that FOLDER@TAG stands for, or None for a name. Raises RunDataError."""
+    return {run_name(directory) for directory in find_runs([Path(run)])} if "@" in run else None
+
+
+def _watch(parsed: argparse.Namespace, credentials: Credentials | None, tagged: set[str] | None) -> int:
     screen = Screen()
     frames = screen.shows_frames and not parsed.json
     shown = _json if parsed.json else _text
     connect = partial(connect_once, parsed.connect, credentials)
-    watch_status(connect, parsed.run, screen, shown, frames=frames)
+    watch_status(connect, parsed.run, screen, shown, frames=frames, tagged=tagged)
     return HEALTHY
 
 
 def watch_status(
-    connect: Callable[[], Transport], run: str, screen: Screen, text: Callable[[RunStatus], str], *, frames: bool
+    connect: Callable[[], Transport],
+    run: str,
+    screen: Screen,
+    text: Callable[[RunStatus], str],
+    *,
+    frames: bool,
+    tagged: Collection[str] | None = None,
 ) -> None:
     """Show the runs until Ctrl-C.
 
@@ -154,6 +182,7 @@ def watch_status(
       screen: where to show them.
       text: returns what is printed about a run where no frames are shown.
       frames: redraw one frame.
+      tagged: names of the runs to show; None: all.
 
     Raises TransportError if the learner refuses this process.
     """
@@ -173,7 +202,8 @@ def watch_status(
 
     with suppress(KeyboardInterrupt):
         try:
-            for runs in looks(open_transport, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+            for found in looks(open_transport, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
+                runs = [each for each in found if tagged is None or each.status.run in tagged]
                 waiting = "" if runs else f"{reason}; waiting for one (Ctrl-C ends)"
                 if frames and runs:
                     screen.show(runs)
@@ -257,7 +287,7 @@ def _table(status: RunStatus) -> list[str]:
     agents = "" if status.agent_steps is None else f" ({status.agent_steps:,} agent_steps)"
     return [
         f"run {status.run}: {status.environment}, {status.algorithm}, up {status.uptime_seconds:.0f} s, "
-        f"epoch {status.learner_epoch:x}",
+        f"epoch {status.learner_epoch:x}{f', {status.software}' if status.software else ''}",
         *(f"  PROBLEM: {problem}" for problem in status.problems),
         *_expiry(status.certificate_days_left),
         f"  {rating}return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}{agents}, "
@@ -277,6 +307,7 @@ def _table(status: RunStatus) -> list[str]:
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
         *(f"  {actor.actor} {text}" for actor in status.actors for text in _actor_texts(actor)),
         *_places(status.actors),
+        *_releases(status),
         *map(_refused, status.refused_joins),
     ]
 
@@ -392,6 +423,22 @@ def _places(actors: Sequence[ActorStatus]) -> list[str]:
         f"  on {host or 'an unknown host'}{f', {software}' if software else ''}: {', '.join(names)}"
         for (host, software), names in by_host.items()
     ]
+
+
+def _releases(status: RunStatus) -> list[str]:
+    """Return which releases take part, if there are several: the fleet is being upgraded."""
+    counts = status.releases
+    if len(counts) < 2:
+        return []
+    named = [
+        f"{software or 'unknown'}: {' and '.join(filter(None, ('the learner' * of_learner, _actors(count))))}"
+        for software, (of_learner, count) in counts.items()
+    ]
+    return [f"  releases: {'; '.join(named)}"]
+
+
+def _actors(count: int) -> str:
+    return f"{count:,} actor{'s' * (count > 1)}" if count else ""
 
 
 def _client_texts(actor: ActorStatus) -> list[str]:

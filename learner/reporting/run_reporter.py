@@ -26,6 +26,7 @@ from daedalus.learner.serving.run_context import RunContext
 from daedalus.policy.saving.best_checkpoints import set_aside_newer
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import RunStatus
+from daedalus.protocol.releases import own_release
 from daedalus.transport.process_usage import UsageMeter
 
 if TYPE_CHECKING:
@@ -212,6 +213,7 @@ class RunReporter:
             decoding_share=rates.decoding_share,
             league=self._league(),
             lessons=context.lessons.texts(counters.env_steps),
+            software=own_release(),
         )
 
     def summary(self, *, finished: bool, now: float, stopped_by: str = "") -> dict[str, Any]:

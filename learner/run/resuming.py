@@ -30,7 +30,7 @@ _logger = logging.getLogger(__name__)
 # to them.
 _FIXED_SECTIONS = ("environment.", "policy.")
 _FIXED = {"training.algorithm", "training.optimizer", "training.seed", "training.normalize_rewards", "league.sides"}
-_CHANGEABLE = {"environment.max_episode_steps", "environment.processes"}
+_CHANGEABLE = {"environment.max_episode_steps", "environment.package", "environment.processes"}
 
 
 def with_changes(

@@ -10,6 +10,7 @@ evaluation.json  result of the final evaluation, with the return of each episode
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 report.html      a page about the run, which `daedalus train` leaves at its end
 tracker-*.json   how far each tracker has logged the run
+labels.json      tags and a note, by daedalus runs
 league/          of a game: kept versions of the policy, and the policies of other runs that are opponents
 """
 
@@ -40,7 +41,7 @@ CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.js
 OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
 OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
 CONFIRMATION_OUTPUT = "confirmation.log"  # of a learner's evaluator, where the launcher writes output.log
-REPORT = "report.html"
+REPORT, LABELS = "report.html", "labels.json"
 DEMONSTRATIONS = "demonstrations"  # folder of rollouts (demonstration_files.py)
 LEAGUE = "league"  # folder of kept versions and of other runs' policies that are opponents
 TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Self
 
+from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.regular_files import foreign_entry, open_own
 
@@ -43,6 +44,7 @@ class RunLock:
         If the holder was killed, its learner may take a few seconds to end: wait for it.
         """
         self.directory = directory
+        self.is_held = False  # whether the file system, or the system, has locks
         try:
             if reason := foreign_entry(directory):  # somebody may have sent the directory
                 raise SettingsError(f"run directory {directory}: {reason}")
@@ -80,7 +82,7 @@ class RunLock:
             if time.monotonic() > began + limit:
                 holder = f"process {process} on {host}" if process else "another process"
                 raise RunInUseError(
-                    f"run directory {self.directory} is in use by {holder}: stop it first, or choose another --run-dir"
+                    f"run directory {self.directory} is in use by {holder}: stop it first, or choose another directory"
                 )
             time.sleep(_POLL_SECONDS)
         if not self._is_there():
@@ -102,6 +104,8 @@ class RunLock:
             _logger.warning(
                 "the file system of %s has no locks: start no second learner in this run directory", self.directory
             )
+        else:
+            self.is_held = True
         return True
 
     def _is_there(self) -> bool:
@@ -116,6 +120,22 @@ class RunLock:
         text = os.pread(self._descriptor, 300, 0).decode(errors="replace")
         named = re.fullmatch(r"(\d{1,10}) ([\w.-]{1,255})\n", text)
         return (int(named[1]), named[2]) if named else (0, "")
+
+
+def lock_idle(directory: Path) -> RunLock:
+    """Return the lock of a run that no learner trains, for whoever reads all of it or removes it.
+
+    Where there are no locks, a learner may be at work that has not removed its heartbeat file. Raises RunInUseError,
+    SettingsError.
+    """
+    lock = RunLock(directory)
+    if not lock.is_held and (directory / HEARTBEAT).exists():
+        lock.close()
+        raise RunInUseError(
+            f"a learner may be at work in {directory}, where locks do not tell: stop it; if there is none, remove "
+            f"{directory / HEARTBEAT}"
+        )
+    return lock
 
 
 def is_locked(directory: Path) -> bool:

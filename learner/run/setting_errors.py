@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from daedalus.protocol.models import meanings
+from daedalus.protocol.releases import REPLACED_SETTINGS, REPLACED_VALUES
 from daedalus.protocol.spec import RunSpec
 
 _FORMS = {"environment.wrap": "module:function"}  # of settings whose description does not begin with their form
@@ -37,6 +38,8 @@ def one_line(error: ValidationError) -> str:
         return f"setting {name} is empty"
     if kind == "tuple_type":
         return f"setting {name} is {value!r}{_as_list(path, value)}"
+    if replacement := isinstance(value, str) and REPLACED_VALUES.get((name, value)):
+        return f"setting {name} is {value!r}, which is of an earlier release: {replacement!r} replaces it"
     if kind == "string_pattern_mismatch":
         hint = f": write {_FORMS[name]}" if name in _FORMS else f". {_description(path)}"
         return f"setting {name} is {value!r}, which is not valid{hint}"
@@ -80,10 +83,12 @@ def _path(location: tuple[int | str, ...]) -> list[str]:
 
 def unknown_setting(path: list[str], section: list[str]) -> str:
     """Return the message for a name that is not in a section of the settings, with what its user may have meant."""
-    known = known_names(section)
+    name, known = ".".join(path), known_names(section)
+    if replacement := REPLACED_SETTINGS.get(".".join([*section, path[-1]])):
+        return f"setting {name} is of an earlier release: {replacement} replaces it"
     near = [".".join([*path[:-1], name]) for name in difflib.get_close_matches(path[-1], known, 3, 0.5)]
     hint = f"did you mean {' or '.join(near)}?" if near else f"the settings are {', '.join(known)}"
-    return f"unknown setting {'.'.join(path)}: {hint}"
+    return f"unknown setting {name}: {hint}"
 
 
 def _as_list(path: list[str], value: Any) -> str:

@@ -36,6 +36,7 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
+from daedalus.protocol.releases import own_release
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.transport.interface import Request
 
@@ -186,6 +187,7 @@ class JoinResponses:
             seed=seed,
             epsilon=epsilon,
             spec=self._spec,
+            software=own_release(),
         )
         return encode(welcome)
 
@@ -220,7 +222,7 @@ def _read_join(name: str, data: bytes) -> Join | Refusal:
     try:
         message = decode(data, JOIN_LIMITS)
     except ProtocolError as error:
-        return Refusal(code="mismatch", reason=str(error))
+        return Refusal(code="mismatch", reason=str(error), software=own_release())
     if not isinstance(message, Join):
         return Refusal(code="malformed", reason="expected a Join message")
     if message.actor != name:

@@ -36,6 +36,10 @@ class ImageLayout:
         frames = observations.reshape(-1, *self._split)  # [N, k, C, H, W] or [N, k, H, W, C]
         if colours_last(self.space.shape):
             frames = frames.permute(0, 1, 4, 2, 3)
+        if self.shape[0] == 1 and not torch.onnx.is_in_onnx_export():
+            # One channel is contiguous in both formats, and torch would take the other, in which a CPU pools ten times
+            # as slowly: let the strides say which it is.
+            return frames.reshape(-1, *self.shape[1:], 1).permute(0, 3, 1, 2)
         return frames.flatten(1, 2).contiguous(memory_format=torch.channels_last)
 
 

@@ -15,12 +15,13 @@ from typing import Annotated
 import numpy as np
 import safetensors
 import safetensors.numpy
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, ValidationError
 
 from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.limits import LEARNER_LIMITS
+from daedalus.protocol.releases import unknown_settings
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -165,5 +166,7 @@ def read_policy(directory: Path) -> SavedPolicy:
             program=sealed.read(PROGRAM_FILE, POLICY_LIMITS[PROGRAM_FILE]),
             weights=safetensors.numpy.load(sealed.read(PARAMETERS_FILE, POLICY_LIMITS[PARAMETERS_FILE])),
         )
+    except ValidationError as error:
+        raise DamagedError(f"{directory}: written by another release ({unknown_settings(error)})") from None
     except (KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
         raise DamagedError(f"{directory}: written by another release ({type(error).__name__})") from None

@@ -145,6 +145,11 @@ class SealedDirectory:
         self._files = parsed.files
         self.content = parsed.content
 
+    @property
+    def checksums(self) -> dict[str, str]:
+        """SHA-256 of each file besides the manifest, by its name."""
+        return {name: file.sha256 for name, file in self._files.items()}
+
     def read(self, name: str, limit: int) -> bytes:
         """Return the bytes of a file. Raises DamagedError if it is missing, damaged or larger than `limit` bytes."""
         entry = self._files.get(name)

@@ -106,7 +106,7 @@ def test_reason_why_nobody_lets_the_client_join_is_raised(learner: ScriptedLearn
     """The client's thread notices the end of `timeout` when it asks again, a moment later than the caller's."""
     learner.refusal = Refusal(code="name_taken", reason="actor name 'robot' is already in use")
     with pytest.raises(ActorError, match="actor name 'robot' is already in use"):
-        Client("tcp/127.0.0.1:1", **SPACES, name="robot", timeout=0.1)
+        Client("tcp/127.0.0.1:1", **SPACES, name="robot", timeout=1.0)
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,22 @@
 """Parameters that the learner sets: how actors apply, draw and acknowledge them."""
 
+import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
 from collectors import collect, snapshot, started_collector
+from lesson_environment import PathWithMethod
 from plain import PlainPolicy
+from test_client_collector import IDENTITY, Played
 
 from daedalus.actor.checking.play import check_environment
-from daedalus.actor.collecting.client_rows import check_run
+from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.errors import ActorError
+from daedalus.learner.run.lesson_progress import lessons_violation
 from daedalus.protocol.lessons import LessonPlan, LessonRange, LessonSpec
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.uploads import Rollout
@@ -132,9 +136,108 @@ def test_environments_that_share_a_vector_entry_point_are_made_one_by_one() -> N
     assert len(set(rollout.lessons["high"].tolist())) == len(rollout.episode_returns) > 1
 
 
-def test_clients_and_older_actors_refuse_a_run_with_lessons() -> None:
-    """A client's environment is its own; an older actor finds settings in `changed` that it does not know."""
+def test_older_actors_refuse_a_run_with_lessons() -> None:
+    """They find settings in `changed` that they do not know."""
     spec = RunSpec(environment=path(), lessons=LESSONS).for_actors()
     assert {"environment.parameters", "lessons"} <= set(spec.changed)
-    with pytest.raises(ActorError, match="this run has lessons for stones, and a client's own loop makes its"):
-        check_run(spec)
+
+
+class Walker:
+    """A client's loop with a path, which it makes as long as the parameters say."""
+
+    def __init__(self, agents: int = 1, **training: Any) -> None:
+        settings = {"algorithm": "impala", **training}
+        self.spec = RunSpec.model_validate(
+            {
+                "environment": path().model_dump(),
+                "lessons": LESSONS,
+                "collection": {"rollout_length": 20},
+                "training": settings,
+            }
+        )
+        self.played = Played(self.spec)
+        self.path = PathWithMethod(always_opens=True)
+        self.client = ClientCollector(self.path.observation_space, self.path.action_space, None, agents=agents)
+        self.client.prepare(self.spec.for_actors())
+        self.begin(plan((1, 2), (5, 5)))
+
+    def begin(self, lessons: LessonPlan) -> None:
+        """Let another learner begin."""
+        self.client.begin(self.played.runtime(), self.spec.for_actors(), 3)
+        self.load(0, lessons)
+
+    def load(self, version: int, lessons: LessonPlan | None) -> None:
+        self.client.load(replace(self.played.snapshot(version), lessons=lessons))
+
+    def episode(self, agent: int = 0, *, truncated_after: int = 0) -> int:
+        """Play an episode; return its length."""
+        player = self.client.agents[agent]
+        self.path.set_parameters(stones=int(player.parameters["stones"]))
+        assert player.parameters == {"stones": self.path.stones}  # the same, whenever it is asked
+        observation, _ = self.path.reset()
+        for length in itertools.count(1):
+            observation, reward, terminated, _, _ = self.path.step(player.act(observation))
+            assert player.parameters == {"stones": self.path.stones}
+            player.reward(reward)
+            if terminated or length == truncated_after:
+                player.end_episode(terminated=terminated, observation=observation)
+                return length
+        raise AssertionError
+
+    def rollout(self) -> Rollout:
+        taken = self.client.collect(IDENTITY)
+        assert taken is not None
+        return taken
+
+
+def test_a_client_plays_and_acknowledges_the_parameters() -> None:
+    walker = Walker()
+    lengths = [walker.episode() for _ in range(12)]
+    first = walker.rollout()
+    assert played(first) == lengths[: len(first.episode_returns)]
+    assert set(lengths) == {1, 2, 5}
+    walker.load(1, plan((3, 3)))
+    walker.load(2, None)  # without a plan: the last one goes on
+    assert [walker.episode() for _ in range(16)][-6:] == [3] * 6
+    while walker.client.has_rollout():
+        rollout = walker.rollout()
+        assert (lessons_violation(rollout, walker.spec), played(rollout) != []) == ("", True)
+
+
+def test_a_client_that_does_not_ask_for_the_parameters_is_told_to() -> None:
+    walker = Walker()
+    with pytest.raises(ValueError, match=r"sets parameters of the environment \(stones\): ask for `parameters`"):
+        walker.client.agents[0].act(np.zeros(1, np.float32))
+    walker.episode()
+    with pytest.raises(ValueError, match="before the first act of each episode"):
+        walker.client.agents[0].act(np.zeros(1, np.float32))
+    walker.episode()  # the refused calls have changed nothing
+
+
+def test_a_client_keeps_the_parameters_of_its_episode_when_another_learner_begins() -> None:
+    walker = Walker()
+    agent = walker.client.agents[0]
+    begun = agent.parameters
+    walker.begin(plan((4, 4)))
+    assert agent.parameters == begun  # with which the loop has made its environment
+    agent.act(np.zeros(1, np.float32))
+    walker.begin(plan((4, 4)))
+    agent.act(np.zeros(1, np.float32))
+    assert agent.parameters == begun
+    agent.end_episode(terminated=True)
+    assert agent.parameters == {"stones": 4}
+
+
+def test_agents_whose_rollouts_are_sent_as_one_acknowledge_all_their_episodes() -> None:
+    walker = Walker(agents=3, algorithm="a2c")
+    assert not walker.client.has_rollout()
+    assert walker.client.collect(IDENTITY) is None  # the agents may begin
+    while not walker.client.has_rollout():
+        for agent in range(3):
+            walker.episode(agent, truncated_after=4)
+    rollout = walker.rollout()
+    assert lessons_violation(rollout, walker.spec) == ""
+    assert len(rollout.lessons["stones"]) == len(rollout.episode_returns) > 10
+    full = rollout.lessons["stones"] < 5
+    assert (rollout.lessons["stones"] == rollout.episode_lengths)[full].all()
+    assert (rollout.episode_lengths[~full] == 4).all()

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from recorded_runs import TARGET, record
 
-from daedalus.analysis.recorded_run import SECONDS, find_runs, read_run
+from daedalus.analysis.recorded_run import SECONDS, read_run
+from daedalus.analysis.run_selection import find_runs
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunLock

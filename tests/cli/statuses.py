@@ -58,6 +58,7 @@ def run_status(**changes: Any) -> RunStatus:
         "busy_answers": 5,
         "refused_joins": (),
         "actors": (),
+        "software": "daedalus-rl 1.0",
     }
     return RunStatus(**{**values, **_counts(changes.get("actors", ())), **changes})
 

@@ -4,15 +4,18 @@ import io
 import json
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from log_lines import LINES
 from processes import LIMIT, until
+from recorded_runs import record
 from statuses import actor_status, run_status
 from terminal import Terminal
 
+from daedalus.analysis.run_selection import change_tag
 from daedalus.cli import screen
 from daedalus.cli.commands import status as status_module
 from daedalus.cli.commands.status import status as status_command
@@ -199,3 +202,23 @@ def test_a_fault_of_the_display_does_not_disturb_training(
     display._thread.join(LIMIT)
     display.end()
     assert LINES == ["the display has ended: ZeroDivisionError: division by zero; training continues"]
+
+
+def test_a_tag_shows_the_runs_whose_directories_have_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    learner, other = Learner(run="mine"), Learner(run="theirs")
+    other.transport.close()
+    other.transport = MemoryTransport(learner.network)
+    other.transport.serve(keys.status("theirs"), other._answer)
+    monkeypatch.setattr(status_module, "connect_once", learner.connect)
+    for name in ("mine", "ended"):
+        change_tag(record(tmp_path / name), "paper", remove=False)
+    change_tag(tmp_path / "ended", "old", remove=False)
+    words = ["--connect", "tcp/127.0.0.1:1", "--json", "--run"]
+    status_command([*words, f"{tmp_path}@paper"])
+    assert [json.loads(line)["run"] for line in capsys.readouterr().out.splitlines()] == ["mine"]
+    assert status_command([*words, f"{tmp_path}@old"]) == 1
+    assert "no learner of a run with this tag answers; they are ended" in capsys.readouterr().err
+    assert status_command([*words, f"{tmp_path}@none"]) == 1
+    assert "has the tag 'none': the tags there are old, paper" in capsys.readouterr().err

@@ -49,15 +49,20 @@ def alternatives(command: str) -> list[str]:
     return [command.replace(choice[0], option) for option in choice[1].split("|")]
 
 
+_Verbs = argparse._SubParsersAction
+
+
 def parse(words: Sequence[str], *, whole: bool) -> argparse.Namespace:
     """Return the parsed command line. Unless it is `whole`, it may lack required arguments."""
     command, *arguments = words
     assert command in COMMANDS, f"`daedalus {command}`: there is no such command"
     parser = COMMANDS[command].make_parser()
-    for action in parser._actions:
-        action.required = action.required and whole
-    for group in parser._mutually_exclusive_groups:
-        group.required = group.required and whole
+    verbs = [each for action in parser._actions if isinstance(action, _Verbs) for each in action.choices.values()]
+    for part in [parser, *verbs] if not whole else []:
+        for action in part._actions:
+            action.required = False
+        for group in part._mutually_exclusive_groups:
+            group.required = False
     return parser.parse_args(arguments)
 
 

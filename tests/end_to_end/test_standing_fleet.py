@@ -104,14 +104,17 @@ def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release
     start: Start, address: str, tmp_path: Path
 ) -> None:
     with closing(listen([address])):
-        actor = start("actor", "--connect", address, "--name", "standing", "--envs", 4, "--stay")
+        (tmp_path / "elsewhere").mkdir()  # without the module of the run
+        asked = ("actor", "--connect", address, "--name", "standing", "--envs", 4, "--stay")
+        actor = start(*asked, directory=tmp_path / "elsewhere")
         newer = bytearray(encode(Refusal(code="not_ready", reason="")))
         newer[4] += 1  # the version
         with closing(connect([address])) as foreign:
             foreign.serve(keys.join("foreign", "*"), lambda request: request.reply(bytes(newer)))
             actor.expect("the other end uses protocol version .*; trying again")
-        first = start("learner", "--env", "slow_environment:Slow-v0", "--connect", address, "--run-dir", "theirs")
-        actor.expect("slow_environment.*; trying again")
+        theirs = ("--env", "slow_environment:Slow-v0", "--set", "environment.package=slow-games==1.2")
+        first = start("learner", *theirs, "--connect", address, "--run-dir", "theirs")
+        actor.expect('slow_environment is not installed here; .*: pip install "slow-games==1.2"; trying again')
         first.expect("failed .*slow_environment")
         first.end()
         second = start("learner", "cartpole", "--connect", address, "--run-dir", "ours", "--env-steps", 3000)

@@ -208,7 +208,7 @@ def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ende
     assert second.wait() == 1
     assert second.lines == [
         f"daedalus resume: run directory orphan-run is in use by process {running.process.pid} on "
-        f"{socket.gethostname()}: stop it first, or choose another --run-dir"
+        f"{socket.gethostname()}: stop it first, or choose another directory"
     ]
     running.process.kill()
     until(lambda: not processes_mentioning(address) and not processes_mentioning("orphan-run"))

@@ -25,8 +25,10 @@ from daedalus.gateway.client_messages import Act
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, PolicyError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
+from daedalus.protocol.lessons import LessonPlan, LessonRange
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import RunSpec
 from daedalus.transport import retries
 from daedalus.transport.interface import Declaration, Request, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -112,6 +114,35 @@ def test_end_of_an_episode_is_a_row_of_the_rollout(learner: ScriptedLearner, con
     assert rollout.truncated[:, 0].tolist() == [False, False, False, True]
     assert rollout.valid[:, 0].tolist() == [True, False, True, True]
     assert rollout.rewards[:, 0].tolist() == [3.0, 0.0, 1.0, 0.0]
+
+
+def test_a_client_plays_and_acknowledges_the_parameters_of_the_run(network: MemoryNetwork, connect: Connect) -> None:
+    changed = {"environment": {**SPEC.environment.model_dump(), "parameters": {"speed": 1, "wind": 0.5}}}
+    lessons = {"speed": {"between": [2, 9]}}
+    learner = ScriptedLearner(network, RunSpec.model_validate({**SPEC.model_dump(), **changed, "lessons": lessons}))
+    learner.lessons = LessonPlan(ranges={"speed": (LessonRange(low=4, high=6),)})
+    learner.publish(0)
+    client = connect()
+    client.hello("arm-1")
+    speeds = []
+    for _ in range(8):
+        refusal = client.act([0.0] * 4)
+        assert refusal["code"] == "misfit"
+        assert "ask for `parameters` before the first act" in refusal["reason"]
+        for _ in range(2):  # the same for one episode
+            client.send("parameters")
+        answers = [client.receive() for _ in range(2)]
+        assert answers[0] == answers[1]
+        assert answers[0]["parameters"].keys() == {"speed", "wind"}
+        speeds.append(answers[0]["parameters"]["speed"])
+        client.act([0.0] * 4)
+        client.send("end_episode", terminated=True)
+    assert len(set(speeds)) > 1
+    assert set(speeds) <= {4, 5, 6}
+    rollout, _ = learner.receive()  # each episode has a row and a reset
+    assert rollout.lessons["speed"].tolist() == speeds[: len(rollout.episode_returns)]
+    assert len(rollout.episode_returns) == 2
+    learner.transport.close()
 
 
 def test_msgpack_clients_may_send_bytes_for_arrays(learner: ScriptedLearner, connect: Connect) -> None:

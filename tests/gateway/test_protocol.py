@@ -21,11 +21,12 @@ SCHEMA = json.loads(importlib.resources.files("daedalus.gateway").joinpath("prot
 OBSERVATION = [0.1, 0.2, 0.3, 0.4]
 LEGAL = {  # written out again, independent of the code
     "new": {"hello"},
-    "between episodes": {"act"},
+    "between episodes": {"parameters", "act"},
     "in an episode": {"act", "reward", "end_episode"},
 }
 MESSAGES: dict[str, dict[str, Any]] = {
     "hello": {"version": 1, "name": "any", **CARTPOLE},
+    "parameters": {},
     "act": {"observation": OBSERVATION},
     "reward": {"reward": 0.5},
     "end_episode": {"terminated": True, "observation": OBSERVATION},
@@ -70,7 +71,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.client = JsonClient(self.gateway.port)
         self.state, self.faults = "new", 0
 
-    @rule(kind=st.sampled_from(["hello", "act", "act", "act", "reward", "end_episode"]))
+    @rule(kind=st.sampled_from(["hello", "parameters", "act", "act", "act", "reward", "end_episode"]))
     def send(self, kind: str) -> None:
         if self.state == "closed":
             self.client = JsonClient(self.gateway.port)
@@ -85,6 +86,10 @@ class AnyOrder(RuleBasedStateMachine):
             check(answer, "gateway")
             assert answer["type"] == "welcome"
             self.state = "between episodes"
+        if kind == "parameters":
+            answer = self.client.receive()
+            check(answer, "gateway")
+            assert answer == {"type": "parameters", "parameters": {}}
         if kind == "act":
             answer = self.client.receive()
             check(answer, "gateway")

@@ -25,6 +25,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
+from daedalus.protocol.releases import own_release
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -78,7 +79,10 @@ def test_join_of_another_protocol_version_is_listed_with_its_host_and_version() 
     assert answer.code == "mismatch"
     (listed,) = fleet.refused_joins.report(0.0)
     assert (listed.actor, listed.host, listed.software) == ("a", "arm-box", "daedalus-rl 9.9")
-    assert f"the other end uses protocol version {PROTOCOL_VERSION + 1}" in listed.reason
+    own = own_release()
+    remedy = f"upgrade the end that has {own} to daedalus-rl 9.9"
+    assert listed.reason == f"{own} cannot read messages of daedalus-rl 9.9: {remedy}"
+    assert answer.software == own
 
 
 def test_failure_that_an_actor_reports_is_listed_and_answered() -> None:

@@ -206,7 +206,7 @@ def test_a_second_lock_is_refused_with_the_holder_until_the_first_is_closed(tmp_
         RunLock(tmp_path)
     assert str(refused.value) == (
         f"run directory {tmp_path} is in use by process {os.getpid()} on {socket.gethostname()}: "
-        "stop it first, or choose another --run-dir"
+        "stop it first, or choose another directory"
     )
     RunLock(tmp_path).close()
 

@@ -310,6 +310,8 @@ def test_value_out_of_range_error_names_the_range(assignment: str, range_: str) 
     [
         ("training.learning_rte=0.1", "unknown setting training.learning_rte: did you mean training.learning_rate"),
         ("trainin.seed=1", "unknown setting trainin: did you mean training?"),
+        ("environment.patience=9", "patience is of an earlier release: environment.no_reward_limit replaces it"),
+        ("environment.backend=sketch", "backend is 'sketch', which is of an earlier release: 'fast' replaces it"),
         ("policy.zzz=1", "the settings are activation, codes, distribution, encoder, hidden"),
         (f"environment.kwargs.size={10**30}", "environment.kwargs cannot be sent to actors: "),
         *((f"training.target_return={value}", "setting training.target_return ") for value in ("nan", "inf")),

@@ -223,6 +223,18 @@ def test_layouts_of_one_frame(name: str) -> None:
     torch.testing.assert_close(first(channels_first), deeper(torch.from_numpy(colours)), atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", ENCODERS)
+def test_convolutions_of_one_grey_frame_have_channels_last(name: str) -> None:
+    made: list[Tensor] = []
+    whole = build_encoder(PolicySpec(encoder=name), {NAME: ArraySpace(shape=(40, 44), dtype="uint8")})
+    for module in whole.modules():
+        if isinstance(module, nn.Conv2d):
+            module.register_forward_hook(lambda _module, _inputs, output: made.append(output))
+    whole({NAME: torch.zeros(2, 40, 44, dtype=torch.uint8)})
+    assert made
+    assert all(each.is_contiguous(memory_format=torch.channels_last) for each in made)
+
+
 def test_colours_are_on_the_shorter_of_the_outer_axes() -> None:
     pictures = observations(ArraySpace(shape=(5, 40, 44), dtype="uint8"), (2,))
     first, last = (encoder_of("nature", shape) for shape in ((5, 40, 44), (40, 44, 5)))

@@ -261,6 +261,20 @@ def test_policy_of_another_format_is_refused_with_both_formats(tmp_path: Path, n
             read(run if read is find_policy else directory)
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("patience", r"environment\.no_reward_limit replaces environment\.patience"),
+        ("newer", r"setting environment\.newer"),
+    ],
+)
+def test_a_setting_of_another_release_is_named(tmp_path: Path, name: str, text: str) -> None:
+    environment = {**POLICY_CONTENT["spec"]["environment"], name: 7}
+    write_sealed(tmp_path / "7", POLICY_FILES, {**POLICY_CONTENT, "spec": {"environment": environment}})
+    with pytest.raises(DamagedError, match=rf"written by another release \(.*{text}\)"):
+        read_policy(tmp_path / "7")
+
+
 def test_a_directory_without_a_policy_is_named_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(NoPolicyError, match=r"nowhere does not exist: name a run directory or one of its checkpoints"):
         find_policy(tmp_path / "nowhere")

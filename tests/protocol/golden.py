@@ -151,13 +151,14 @@ MESSAGES: dict[str, Message] = {
     "welcome": Welcome(
         run="r",
         learner_epoch=9,
+        software="daedalus-rl 1.2.3",
         seed=3,
         epsilon=0.125,
         spec=RunSpec(
             environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}, training_kwargs={"b": 2.5})
         ).for_actors(),
     ),
-    "refusal": Refusal(code="mismatch", reason="other spaces"),
+    "refusal": Refusal(code="mismatch", reason="other spaces", software="daedalus-rl 1.2.3"),
     "program": Program(hash="0" * 64, model=np.zeros(400, np.uint8)),
     "rollout_numbers": _rollout(np.linspace(-1, 1, (_T + 1) * _E * 4, dtype=np.float32).reshape(_T + 1, _E, 4)),
     "rollout_pixels": _rollout(_PIXELS, np.arange(_T * _E).reshape(_T, _E) == 5),
@@ -272,6 +273,7 @@ MESSAGES: dict[str, Message] = {
                 ),
             ),
             actors=(_ACTOR,),
+            software="daedalus-rl 1.2.3",
         )
     ),
     "events_request": EventsRequest(),

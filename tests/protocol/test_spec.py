@@ -383,6 +383,9 @@ def test_setting_of_a_newer_release_is_refused_where_it_is_used_and_the_actor_ne
     newer.check_known()  # an actor without torch does not need it
     with pytest.raises(UnsupportedRunError, match=r"sets training\.newer, which this release does not know: upgrade"):
         _ = newer.learning_settings
+    older = spec.model_copy(update={"changed": (*spec.changed, "environment.patience")})
+    with pytest.raises(UnsupportedRunError, match=r"patience, which environment\.no_reward_limit replaces .*: upgrade"):
+        older.check_known()
     for path in ("newer", "environment.newer", "environment.grey.newer", "algorithm.newer"):
         newer = spec.model_copy(update={"changed": (*spec.changed, path)})
         with pytest.raises(UnsupportedRunError, match=f"sets {path}, which this release does not know: upgrade"):
