@@ -84,7 +84,9 @@ ALGORITHMS = {
         max_lag_batches=8,  # measured: docs/study.md
     ),
     "impala": AlgorithmRecord(summary="asynchronous, corrected for policy lag", corrected=True),
-    "appo": AlgorithmRecord(summary="asynchronous PPO: several passes over each batch", passes_over_batch=True),
+    "appo": AlgorithmRecord(
+        summary="asynchronous PPO: several passes over each batch", passes_over_batch=True, demonstrations=True
+    ),
     "one_step_q": _of_action_values("Q-learning with one-step targets"),
     "one_step_sarsa": _of_action_values("as one_step_q, on the action that was taken next", next_action=True),
     "n_step_q": _of_action_values("Q-learning with n-step targets"),

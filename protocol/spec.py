@@ -363,7 +363,7 @@ class TrainingSpec(LossSpec):
     has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
     replay_transitions: PositiveInt = 1_000_000
     """Newest transitions that the replay buffer keeps, at most as many as `env_steps`; `sac` only, as are the next
-    seven settings."""
+    eight settings."""
     replay_megabytes: Annotated[float, Field(gt=0.0)] | None = None
     """MiB of memory that the replay buffer may need: one that needs more is refused. Unset: three quarters of the
     memory that is available when the learner starts."""
@@ -383,6 +383,11 @@ class TrainingSpec(LossSpec):
     were played in place of the policy's, where there are any."""
     target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
     """Share of the way that the target critics move to the critics at each update."""
+    cloning_updates: NaturalInt = 1000
+    """Updates before training in which the policy imitates the demonstrations (`--demonstrations`); `appo` only, as is
+    the next setting."""
+    cloning_weight: Annotated[float, Field(ge=0.0)] = 0.1
+    """Weight of the imitation of demonstrations in the loss at the start; it falls linearly to 0 over the budget."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
 

@@ -28,6 +28,7 @@ from daedalus.algorithms.replay_buffer import ReplayBuffer
 from daedalus.learner.run.counters import updates_of
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.training.demonstrations import Cloning
 from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
@@ -179,7 +180,7 @@ class Learner:
         self._ranges, self._reward_name = ConfirmedRanges(), _REWARDS if self._rewards is None else _RETURNS
         self._reward_shares: dict[Rollout, float] = {}  # of the newest batch: with how much of their size they count
         self.far_outside: dict[Upload, str] = {}  # of the newest batch: what was left out, and its component
-        self.demonstrations: ReplayBuffer | None = None  # that are learned from; see learner/training/demonstrations.py
+        self._cloning: Cloning | None = None  # of demonstrations, if there are any
         self.first_pass: FirstPass | None = None  # of the newest batch, until its memory is used for the next one
         self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
         self.metrics = UpdateMetrics(spaces, self.device)
@@ -277,6 +278,7 @@ class Learner:
         """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
         self.first_pass = None  # its memory is used for this batch
         for terms in self._gradients.compute(batch.to(self.device), self.entropy_bonus(progress)):
+            self._add_cloning(progress)
             if not self._make_update(terms, progress):
                 return False
             if self.policy_version == end:
@@ -287,6 +289,38 @@ class Learner:
             self.metrics.add_batch_metrics(batch_metrics(self.first_pass))
         self.metrics.add_batch(batch)
         return True
+
+    def learn_from(self, demonstrations: ReplayBuffer) -> None:
+        """Learn from demonstrations, too, from now on."""
+        forward = self._gradients.forward
+        self._cloning = Cloning(self._network, self._flat, forward, self.spaces, demonstrations)
+
+    def clone(self, beat: Callable[[], None] = lambda: None) -> str:
+        """Let the policy imitate the demonstrations before the first update, and return how well it does, in words.
+
+        `beat` is called before each update. Return an empty string where there is nothing to imitate.
+        """
+        cloning, updates = self._cloning, self._spec.cloning_updates
+        if cloning is None or not updates:
+            return ""
+        self._observations.add(cloning.observations())
+        before, optimizer = cloning.held_out(), build_optimizer(self._spec, self._flat.values)
+        for _ in range(updates):
+            beat()
+            self._flat.gradients.copy_(cloning.gradient())
+            if math.isfinite(self._flat.clip_gradients(self._spec.max_gradient_norm)):
+                optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(0.0))
+        if self._gradients.forward.target_parameters:
+            self._gradients.forward.update_target()
+        return (
+            f"mean log-probability of actions that were held out: {before:.3g} before, {cloning.held_out():.3g} after"
+        )
+
+    def _add_cloning(self, progress: float) -> None:
+        """Add the gradient of the cloning term, whose weight falls to 0 over the budget, to the computed one."""
+        weight = _annealed(self._spec.cloning_weight, 0.0, progress)
+        if self._cloning is not None and weight:
+            self._flat.gradients.add_(self._cloning.gradient(), alpha=weight)
 
     def _make_update(self, terms: Terms, progress: float) -> bool:
         """Make an update with the computed gradient. Return False, without an update, if it is not finite."""

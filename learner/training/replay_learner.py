@@ -48,6 +48,7 @@ class ReplayLearner(Learner):
             "policy": self._optimizer,
             **{name: build_optimizer(spec, values) for name, values in algorithm.learned.items()},
         }
+        self.demonstrations: ReplayBuffer | None = None
         self._begin = max(min(spec.replay_begin, self.replay.capacity // 2), 1)
         self._owed = torch.zeros((), dtype=torch.float64)  # updates that rows have earned, and that are not made yet
         # Of the run: its buffer on the disk has the same.
@@ -57,6 +58,10 @@ class ReplayLearner(Learner):
     def replay_identity(self) -> int:
         """Random number of the run, which its saved replay buffer bears."""
         return int(self._identity)
+
+    def learn_from(self, demonstrations: ReplayBuffer) -> None:
+        """See Learner: they are a share of each minibatch."""
+        self.demonstrations = demonstrations
 
     def updates_of(self, rollouts: Sequence[Upload]) -> int:
         """Return the number of updates that the learner makes after it has received these rollouts."""
