@@ -22,15 +22,14 @@ _KEYS = "keys"
 
 _DESCRIPTION = """\
 Plays episodes and records them into a Minari dataset, with the id of the environment: the policy of a run, a bot of
-your own, random actions, or you at the keyboard. `daedalus train --demonstrations` learns from it. An episode is
+your own, random actions, or you at the keyboard. `daedalus train` learns from it with --demonstrations. An episode is
 recorded when it ends; after Ctrl-C, or when the window is closed, the dataset has those that ended before."""
 
 _EXAMPLES = """\
 examples:
   daedalus record runs/pendulum-sac-s1-20261121-101500 --out pendulum/mine-v0
   daedalus record --env MountainCarContinuous-v0 --by my_module:Pump --out ./car
-  daedalus record --env CarRacing-v3 --by keys --out ./laps --episodes 5 \\
-      --key a=[-1,0.2,0] --key d=[1,0.2,0] --key w=[0,1,0] --key s=[0,0,0.8]
+  daedalus record --env CarRacing-v3 --by keys --key a=[-1,0.2,0] --key d=[1,0.2,0] --key w=[0,1,0] --out ./laps
 
 exit status: 0 all episodes are recorded, 1 failed or stopped, 2 bad usage"""
 
