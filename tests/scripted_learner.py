@@ -2,7 +2,7 @@
 
 import queue
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from plain import vector_spaces
@@ -91,7 +91,8 @@ class ScriptedLearner:
         epsilon = self.epsilons.get(message.actor, 0.0)
         spec = self.spec.for_actors()
         spec = spec.model_copy(update={"changed": spec.changed + self.newer})
-        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=spec)
+        welcome = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=spec)
+        answer: Message = replace(welcome, software="daedalus-rl 9.9") if self.newer else welcome
         request.reply(encode(self.refusal or answer))
 
     def _report(self, request: Request) -> None:

@@ -75,28 +75,20 @@ def other_version(spec: EnvironmentSpec) -> str:
 
 
 def how_to_bring(spec: EnvironmentSpec) -> str:
-    """Return what to do where the package or the module of an environment is missing, as the end of a message."""
-    if spec.package is not None:
-        return f"; {_install(spec)}"
-    modules = sorted({value.partition(":")[0].partition(".")[0] for value in spec.user_modules.values()})
-    if not modules:
-        return ""
-    files = " and ".join(f"{module}.py" for module in modules)
-    return (
-        f"; copy {files} to the folder where this process starts, or install the package (a wheel, or with pip). If it "
-        "is on an index, name it where the run is started: --set environment.package=NAME==VERSION"
-    )
+    """Return how to install the package of an environment, as the end of a message; empty if none is named."""
+    return "" if spec.package is None else f"; {_install(spec)}"
 
 
 def absent(spec: EnvironmentSpec) -> str:
-    """Return which modules of the user are missing here, and how to bring them, as the end of a message."""
+    """Return which modules of the user are missing here, and what to do, as the end of a message."""
     tops = {value.partition(":")[0].partition(".")[0] for value in spec.user_modules.values()}
-    missing = [top for top in sorted(tops) if _origin(top) is None and not any(map(Path.exists, _files(top)))]
-    return f"; {' and '.join(missing)} is not installed here{how_to_bring(spec)}" if missing else ""
-
-
-def _files(module: str) -> list[Path]:
-    return [Path(f"{module}.py"), Path(module)]
+    missing = [
+        top for top in sorted(tops) if _origin(top) is None and not (Path(top).exists() or Path(f"{top}.py").exists())
+    ]
+    if not missing:
+        return ""
+    folder = "" if spec.package else f": install it, or start in the folder of {missing[0]}.py"
+    return f"; {' and '.join(missing)} is not installed here{folder}{how_to_bring(spec)}"
 
 
 def _install(spec: EnvironmentSpec) -> str:

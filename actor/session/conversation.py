@@ -399,7 +399,12 @@ class Conversation:
         Raises ActorError or RunOverError if refused, and ActorError if learners of several runs answer.
         """
         within = _ANSWER_SECONDS if deadline is None else max(min(deadline - self.now, _ANSWER_SECONDS), _LATE_SECONDS)
-        answers = yield from self.ask(keys.join(run, join.actor), encode(join), within)
+        try:
+            answers = yield from self.ask(keys.join(run, join.actor), encode(join), within)
+        except ActorError as error:  # a learner of another release, whose operator sees then which host to upgrade
+            if not self.run and run != keys.ANY_RUN:  # else the caller reports it, or the run is not known
+                yield from self._report_failure(run, join, error)
+            raise
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
         names = sorted({welcome.run for welcome in welcomes})
         if len(names) > 1:
@@ -453,9 +458,12 @@ class Conversation:
     def ask(self, key: str, payload: bytes = b"", within: float = _ANSWER_SECONDS) -> Steps[list[Message]]:
         """Send a query and return the decoded answers. Raises ActorError if all are of another release."""
         answers = yield Ask(key, payload, within)
-        return (yield Work(partial(self._decode_all, answers)))
+        messages = yield Work(partial(self._decode_all, answers))
+        if isinstance(messages, ActorError):
+            raise messages
+        return messages
 
-    def _decode_all(self, answers: list[bytes]) -> list[Message]:
+    def _decode_all(self, answers: list[bytes]) -> list[Message] | ActorError:
         messages, foreign = list[Message](), None
         for answer in answers:
             try:
@@ -465,7 +473,7 @@ class Conversation:
             else:
                 messages += [] if message is None else [message]
         if foreign is not None and not messages:
-            raise foreign
+            return foreign
         if foreign is not None and str(foreign) != self._noted:
             self._noted = str(foreign)
             _logger.warning("ignored the answer of another learner: %s", foreign)

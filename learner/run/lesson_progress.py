@@ -43,7 +43,8 @@ class LessonState(BaseModel):
 
     settings: dict[str, Any]  # of the lesson, and its true value: another lesson begins anew
     step: Annotated[int, Field(ge=0)] = 0  # of `steps`; their number: the true task
-    returns: Annotated[list[float], Field(max_length=1 << 20)] = []  # of the newest episodes with the present value
+    returns: Annotated[deque[float], Field(max_length=1 << 20)] = deque()  # of the newest episodes of the step
+    episodes: Annotated[int, Field(ge=0)] = 0  # of the step
     parts: Annotated[list[PartState], Field(max_length=MAX_RANGES)] = []
 
 
@@ -110,17 +111,22 @@ class _Lesson:
         steps, state, above = self._spec.steps, self.state, self._spec.above
         if steps is None or above is None or state.step >= len(steps) or value != self.value(0):
             return
-        state.returns = (
-            [*state.returns[1 - self._episodes :], episode_return] if self._episodes > 1 else [episode_return]
-        )
-        # Its highest and lowest twentieth count as much as the next: one false return must not end a step.
+        state.returns.append(episode_return)
+        state.episodes += 1
+        if len(state.returns) > self._episodes:
+            state.returns.popleft()
+        # Not after each episode, so that an episode costs the same however many are compared.
+        if len(state.returns) < self._episodes or state.episodes % max(self._episodes // 20, 1):
+            return
+        # The highest and the lowest twentieth count as much as the next: one false return must not end a step.
         aside, ordered = len(state.returns) // 20, np.sort(state.returns)
         mean = float(ordered.clip(ordered[aside], ordered[-1 - aside]).mean())
-        if len(state.returns) < self._episodes or mean < above:
+        if mean < above:
             return
         while state.step < len(steps) and self.value(0) == value:  # equal values in a row are one step
             state.step += 1
-        state.returns = []
+        state.returns.clear()
+        state.episodes = 0
         _logger.info(
             "lesson %s: %s after %s env_steps; the return with %s was %s",
             self.name,

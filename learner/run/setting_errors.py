@@ -34,6 +34,11 @@ def one_line(error: ValidationError) -> str:
         return f"setting {name} is missing: add it"
     if not name:
         return message
+    if kind == "model_type" and len(path) > 1:  # of a table of tables, each with a name
+        known = known_names(path)
+        if path[-1] in known:
+            return f"setting {name} does not say of what: write {path[0]}.NAME.{path[-1]}, with the name of a parameter"
+        return f"setting {name} is {value!r}, and not one of its settings: write {name}.{f', {name}.'.join(known)}"
     if kind == "string_too_short" and value == "":  # a NumPy array has no truth value
         return f"setting {name} is empty"
     if kind == "tuple_type":

@@ -56,9 +56,10 @@ def test_a_missing_module_is_named_with_what_brings_it(allowed: bool) -> None:
         make_environments(bare.model_copy(update={"package": "far-away[all]==1.2"}), 1, modules=modules)
     for error in (str(without.value), str(recorded.value)):
         assert ("No module named 'far_away'" in error) == allowed
-        assert ("add --allow-module far_away; far_away is not installed here; " in error) != allowed
+        assert ("add --allow-module far_away; far_away is not installed here" in error) != allowed
+        assert len(error) < 300  # what a learner keeps of it for its status
         assert "\n" not in error
-    assert "copy far_away.py to the folder where this process starts, or install the package" in str(without.value)
+    assert str(without.value).endswith(": install it, or start in the folder of far_away.py")
     assert str(recorded.value).endswith('; if you trust the run, install its package: pip install "far-away[all]==1.2"')
 
 

@@ -13,6 +13,7 @@ from daedalus.actor.errors import ActorError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, Welcome
+from daedalus.protocol.releases import own_release
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
@@ -125,6 +126,7 @@ def test_run_that_uses_a_setting_of_a_newer_release_is_refused_and_the_learner_n
     actor.join()
     assert isinstance(actor.error, ActorError)
     assert str(actor.error).startswith("the run sets environment.newer, which this release does not know: upgrade")
+    assert str(actor.error).endswith(f"release (daedalus-rl 9.9; this process has {own_release()})")
     assert [join.failure for join in learner.joins.queue] == ["", str(actor.error)]
 
 

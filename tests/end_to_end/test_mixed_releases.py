@@ -107,8 +107,8 @@ def test_too_old_processes_name_the_release_that_they_need(start: Start, address
     reason = f"{own} cannot read messages of daedalus-rl 9.9: upgrade the end that has {own} to daedalus-rl 9.9"
     learner.expect("serving run")
     ours.expect("serving run")
-    too_old = start("actor", "--connect", address, "--run", "later")
-    waits = start("actor", "--connect", address, "--run", "later", "--stay")
+    too_old = start("actor", "--connect", address, "--run", "later", "--name", "too-old")
+    waits = start("actor", "--connect", address, "--stay", "--run", "later", "--name", "too-old-2")
     refused = start("actor", "--connect", address, "--run", "ours", "--name", "newer", command=later)
     assert too_old.wait() == 1
     too_old.expect(f"^daedalus actor: {reason}$")
@@ -117,4 +117,5 @@ def test_too_old_processes_name_the_release_that_they_need(start: Start, address
     refused.expect(f"^daedalus actor: the learner refused this actor: {reason}$")
     status = start("status", "--connect", address)
     status.expect("run later: .*, daedalus-rl 9.9$")
-    status.expect("refused: newer .*daedalus-rl 9.9")
+    status.expect("refused: newer .*daedalus-rl 9.9")  # by ours
+    status.expect(rf"refused: too-old\S* .*{own}")  # as it reports to the later one

@@ -14,7 +14,8 @@ from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_a
 from scripted_learner import ScriptedLearner
 
 from daedalus.gateway import client_messages
-from daedalus.gateway.client_messages import ErrorCode
+from daedalus.gateway.client_messages import ClientError, ErrorCode
+from daedalus.protocol.releases import own_release
 from daedalus.transport.memory import MemoryNetwork
 
 SCHEMA = json.loads(importlib.resources.files("daedalus.gateway").joinpath("protocol.json").read_text())
@@ -59,6 +60,18 @@ def test_schema_is_one_and_knows_every_message_and_code() -> None:
 @pytest.mark.parametrize("kind", list(MESSAGES))
 def test_examples_fit_the_schema(kind: str) -> None:
     check({"type": kind, **MESSAGES[kind]}, "client")
+
+
+@pytest.mark.parametrize(
+    ("version", "remedy"),
+    [(2, "upgrade the gateway"), (0, "use the client files of "), ("x" * 90, "use the client files of ")],
+)
+def test_a_client_of_another_version_reads_which_release_it_needs(version: object, remedy: str) -> None:
+    hello = {"type": "hello", **MESSAGES["hello"], "version": version}
+    with pytest.raises(ClientError) as refused:
+        client_messages.read(json.dumps(hello), {"": "new"})
+    assert f", the gateway 1, which {own_release()} has: {remedy}" in refused.value.reason
+    assert len(refused.value.reason) < 200
 
 
 class AnyOrder(RuleBasedStateMachine):

@@ -76,6 +76,17 @@ def test_one_false_return_does_not_end_a_step() -> None:
     assert drawn(lessons) == [(5.0, 5.0, 1.0)]
 
 
+def test_the_mean_of_many_returns_is_looked_at_after_each_twentieth_of_them() -> None:
+    run = spec(steps=[1.0, 5.0], above=0.51)
+    run = run.model_copy(update={"training": run.training.model_copy(update={"target_episodes": 40})})
+    lessons = LessonProgress(run)
+    lessons.add([episodes((1.0, 0.0))] * 40 + [episodes((1.0, 1.0))] * 21, 1)
+    assert drawn(lessons) == [(1.0, 1.0, 1.0)]  # 21 of 40 are enough, but 61 is odd
+    resumed = LessonProgress(run, {NAME: LessonState.model_validate(lessons.states()[NAME])})
+    resumed.add([episodes((1.0, 1.0))], 2)
+    assert drawn(resumed) == [(5.0, 5.0, 1.0)]
+
+
 def test_a_run_may_resume_with_and_without_a_lesson() -> None:
     plain = run_spec(target_episodes=4).model_dump(mode="json")
     without = RunSpec.model_validate({**plain, "environment": {**plain["environment"], "parameters": {NAME: 10.0}}})

@@ -332,6 +332,8 @@ def test_value_out_of_range_error_names_the_range(assignment: str, range_: str) 
         ),
         ("environment.wrap=foo", "setting environment.wrap is 'foo', which is not valid: write module:function"),
         ("environment.id=", "setting environment.id is empty"),
+        ("lessons.start=1", "setting lessons.start does not say of what: write lessons.NAME.start"),
+        ("lessons.speed=1", "setting lessons.speed is 1, and not one of its settings: write lessons.speed.above, "),
         ("policy.encoder=cnn", "setting policy.encoder is 'cnn', which is not valid. Encoder of"),
         ("policy.hidden=[64, 0]", "setting policy.hidden.1 should be"),
         # Of a setting of several types: that of the type that was meant.
