@@ -138,7 +138,12 @@ class LearnerService:
 
         taken = learner.replay.nbytes if isinstance(learner, ReplayLearner) else 0
         directory, spec = self._context.directory, self._context.spec
-        learner.demonstrations = read_demonstrations(directory, spec, learner.spaces, taken, self._heartbeat.beat)
+        demonstrations = read_demonstrations(directory, spec, learner.spaces, taken, self._heartbeat.beat)
+        if demonstrations is None:
+            return
+        learner.learn_from(demonstrations)
+        if self._beginning.restored is None and (result := learner.clone(self._heartbeat.beat)):
+            _logger.info("behaviour cloning: %d updates; %s", spec.training.cloning_updates, result)
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")

@@ -306,6 +306,7 @@ def unread_settings(spec: RunSpec) -> set[str]:
         "training.replay_transitions training.replay_megabytes training.replay_saved training.replay_begin "
         "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate "
         "training.demonstration_share": record.replay,
+        "training.cloning_updates training.cloning_weight": record.demonstrations and not record.replay,
         "training.rmsprop_decay": training.optimizer == "rmsprop",
         "policy.separate_value_encoder": has_returns and policy.memory == "none",
         "policy.memory_units": policy.memory != "none",

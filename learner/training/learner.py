@@ -27,6 +27,8 @@ from daedalus.algorithms.normalization import (
 from daedalus.algorithms.replay_buffer import ReplayBuffer
 from daedalus.learner.run.counters import updates_of
 from daedalus.learner.run.resuming import CheckpointMismatchError
+from daedalus.learner.training.demonstrations import Cloning
+from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.update_graphs import UpdateGraphs, check_device, device_faults
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.learner.training.update_step import UpdateStep
@@ -201,7 +203,7 @@ class Learner:
         self._ranges, self._reward_name = ConfirmedRanges(), _REWARDS if self._rewards is None else _RETURNS
         self._reward_shares: dict[Rollout, float] = {}  # of the newest batch: with how much of their size they count
         self.far_outside: dict[Upload, str] = {}  # of the newest batch: what was left out, and its component
-        self.demonstrations: ReplayBuffer | None = None  # that are learned from; see learner/training/demonstrations.py
+        self._cloning: Cloning | None = None  # of demonstrations, if there are any
         self.first_pass: FirstPass | None = None  # of the newest batch, until its memory is used for the next one
         self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
         # Whether `step` returns before a GPU is done: not if what follows a batch changes how the next is sorted out.
@@ -358,12 +360,19 @@ class Learner:
         self.first_pass = None  # its memory is used for this batch
         self._step.begin(self.learning_rate(progress))
         self._bonus.fill_(self.entropy_bonus(progress))
+        if self._cloning is not None:
+            self._cloning.weight = _annealed(self._spec.cloning_weight, 0.0, progress)
         return self.graphs.call(self._updated, batch, count)
 
     def _updated(self, batch: Batch, count: int) -> "_Made | None":
         """Make updates of a batch on the device, with stacks of frames or without. A graph may record this method."""
-        updates = self._gradients.compute(batch.stacked(), self._bonus, self._step)
-        for number, _ in enumerate(updates, 1):
+        cloning = self._cloning if self._cloning is not None and self._cloning.weight else None
+        updates = self._gradients.compute(batch.stacked(), self._bonus, self._step if cloning is None else None)
+        for number, terms in enumerate(updates, 1):
+            if cloning is not None:
+                self._flat.gradients.add_(cloning.gradient(), alpha=cloning.weight)
+                self._step.clip(terms)
+                self._step.apply()
             if not self.graphs.records:
                 if self._step.has_failed:
                     return None
@@ -372,6 +381,35 @@ class Learner:
                 break
         first_pass = self._gradients.take_first_pass()
         return None if first_pass is None else _Made(first_pass, batch_metrics(first_pass))
+
+    def learn_from(self, demonstrations: ReplayBuffer) -> None:
+        """Learn from demonstrations, too, from now on."""
+        self.graphs.is_enabled = False  # each update draws other demonstrations, on the CPU
+        self.overlaps = False
+        forward = self._gradients.forward
+        self._cloning = Cloning(self._network, self._flat, forward, self.spaces, demonstrations)
+
+    def clone(self, beat: Callable[[], None] = lambda: None) -> str:
+        """Let the policy imitate the demonstrations before the first update, and return how well it does, in words.
+
+        `beat` is called before each update. Return an empty string where there is nothing to imitate.
+        """
+        cloning, updates = self._cloning, self._spec.cloning_updates
+        if cloning is None or not updates:
+            return ""
+        self._observations.add(cloning.observations())
+        before, optimizer = cloning.held_out(), build_optimizer(self._spec, self._flat.values)
+        rate = self._flat.values.new_tensor(self.learning_rate(0.0))
+        for _ in range(updates):
+            beat()
+            self._flat.gradients.copy_(cloning.gradient())
+            norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
+            optimizer.step(self._flat.values, self._flat.gradients, rate, (~norm.isfinite()).to(rate.dtype))
+        if self._gradients.forward.target_parameters:
+            self._gradients.forward.update_target()
+        return (
+            f"mean log-probability of actions that were held out: {before:.3g} before, {cloning.held_out():.3g} after"
+        )
 
     def apply(self, gradients: Sequence[Gradient], progress: float) -> None:
         """Make one update with the mean of gradients that actors computed, weighted by their env_steps.
