@@ -42,6 +42,10 @@ class SettingsError(Exception):
     """Error for invalid settings. The message names the setting, the reason and the correction."""
 
 
+class DeviceLostError(SettingsError):
+    """The device of the learner does not answer any more: what it holds is lost."""
+
+
 def preset_names() -> list[str]:
     """Return the names of the presets that ship with the package, sorted."""
     folder = importlib.resources.files("daedalus.learner.run.presets")

@@ -306,7 +306,7 @@ class RolloutJudge:
                 return violation
         if environment.reward_clip is not None:
             largest = environment.reward_clip * environment.reward_scale
-            if np.abs(rollout.rewards).max() > largest * (1 + 1e-5):
+            if np.abs(rollout.rewards).max() > np.float32(largest * (1 + 1e-5)):
                 return f"rewards has a value outside the clip range of +-{largest:g}"
         return ""
 

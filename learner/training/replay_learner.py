@@ -45,7 +45,7 @@ class ReplayLearner(Learner):
         self._algorithm = algorithm
         self._learned = {"policy": self._flat.values, **algorithm.learned}
         self._optimizers = {
-            "policy": self._optimizer,
+            "policy": self._step.optimizer,
             **{name: build_optimizer(spec, values) for name, values in algorithm.learned.items()},
         }
         self._begin = max(min(spec.replay_begin, self.replay.capacity // 2), 1)
@@ -105,13 +105,14 @@ class ReplayLearner(Learner):
         if not all(map(math.isfinite, norms.values())):
             self.updates_skipped += 1
             return
+        rate, made = (torch.tensor(value, device=self.device) for value in (self.learning_rate(progress), 0.0))
         for name, gradient in gradients.items():
             if norms[name] > spec.max_gradient_norm:
                 gradient = gradient * (spec.max_gradient_norm / norms[name])
-            self._optimizers[name].step(self._learned[name], gradient, self.learning_rate(progress))
+            self._optimizers[name].step(self._learned[name], gradient, rate, made)
         self._gradients.after_update(self.policy_version)
-        clipped = max(norms.values()) > spec.max_gradient_norm
-        self.metrics.add_update(Terms(*terms), math.hypot(*norms.values()), clipped=clipped)
+        self.metrics.add_update(Terms(*terms), rate.new_tensor(math.hypot(*norms.values())))
+        self.metrics.count_updates(1)
 
     def _sampled(self) -> Transitions:
         """Return a minibatch, with its share of demonstrations: Ball et al. (2023), "Efficient Online Reinforcement
