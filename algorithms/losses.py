@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss, mse_loss
 
 from daedalus.algorithms.returns import Targets
+from daedalus.protocol.spec import LossSpec
 
 _ROUNDING = 1e-4  # a deviation below this share of the mean may be only the rounding of float32
 _NEGLIGIBLE = 1e-6  # a variance of the targets below this share of their mean square: they are equal
@@ -27,25 +28,28 @@ def mean(values: Tensor, shares: Tensor) -> Tensor:
     return values.flatten().dot(shares.flatten())
 
 
-def normalized(advantages: Tensor, valid: Tensor) -> Tensor:
+def normalized(advantages: Tensor, valid: Tensor, least: float = 0.0) -> Tensor:
     """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows.
 
-    The deviation is less than 1 where the advantages are equal except for rounding. `valid` [T, B] is 1 or 0.
+    The deviation is less than 1 where the advantages are equal except for rounding, or theirs is less than `least`.
+    `valid` [T, B] is 1 or 0.
     """
     # Not by shares, whose rounding would make equal advantages differ from 0.
     number = valid.sum().clamp(min=1.0)
     average = (advantages * valid).sum() / number
     centred = advantages - average
     deviation = ((centred.square() * valid).sum() / number).sqrt()
-    return centred / (deviation.maximum(_ROUNDING * average.abs()) + 1e-8)
+    return centred / (deviation.maximum(_ROUNDING * average.abs()).clamp(min=least) + 1e-8)
 
 
-def policy_factors(targets: Targets, valid: Tensor, normalize: bool) -> Tensor:
+def policy_factors(spec: LossSpec, targets: Targets, valid: Tensor) -> Tensor:
     """Return w_t A_t [T, B], the factor of row t in the policy loss, with A_t normalised over the valid rows if asked.
 
     A_t is normalised before it is weighted: normalised after, a row with weight 0 would get -mean / std.
     """
-    return targets.weights * (normalized(targets.advantages, valid) if normalize else targets.advantages)
+    if not spec.normalize_advantages:
+        return targets.weights * targets.advantages
+    return targets.weights * normalized(targets.advantages, valid, spec.min_advantage_deviation)
 
 
 def policy_gradient_loss(log_probs: Tensor, factors: Tensor, shares: Tensor) -> Tensor:

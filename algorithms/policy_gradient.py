@@ -29,7 +29,7 @@ class PolicyGradient(Algorithm):
         with torch.no_grad():
             targets = self.targets(batch, log_probs, values)
             shares = shares_of(batch.valid)
-            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages)
+            factors = policy_factors(self.spec, targets, batch.valid)
         yield Losses(
             policy_loss=policy_gradient_loss(log_probs, factors, shares),
             entropies=entropies,
@@ -96,7 +96,7 @@ class Appo(Algorithm):
             parameters, values = forward(batch.observations, batch.initial_state, batch.starts)
             log_probs = self.distribution.log_prob(parameters[:-1], batch.actions, batch.masks)
             targets = lambda_targets(self.spec, batch, log_probs, values)
-            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages)
+            factors = policy_factors(self.spec, targets, batch.valid)
         first_pass = FirstPass(
             log_probs, batch.behaviour_log_probs, values[:-1], targets.values, targets.advantages, batch.valid
         )

@@ -298,6 +298,9 @@ class LossSpec(Specification):
     normalize_advantages: bool = False
     """Scale the advantages of each batch to mean 0 and standard deviation 1. With `collection.upload=gradients`, each
     actor scales those of each rollout."""
+    min_advantage_deviation: Annotated[float, Field(ge=0.0)] = 0.0
+    """With `normalize_advantages`: smallest standard deviation that advantages are divided by. With 1, and normalised
+    rewards, small ones are not scaled up, such as those of a task that is solved."""
 
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Precision of the forward passes. `auto`: bfloat16 for convolutions where the hardware multiplies it."""
