@@ -1,7 +1,8 @@
-# Two targets: `actor`, without torch, and `learner`, with torch. The configuration of pip decides where packages come
-# from; deploy/requirements has their hashes (`make lock`).
+# Three targets: `actor` and `gateway`, without torch, and `learner`, with torch. The configuration of pip decides where
+# packages come from; deploy/requirements has their hashes (`make lock`).
 #
 #   docker build --target actor --tag daedalus-actor .
+#   docker build --target gateway --tag daedalus-gateway .
 #   docker build --target learner --tag daedalus-learner .
 ARG BASE=python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa184956261b4301ebaf6dbb0a3543d
 
@@ -40,6 +41,17 @@ FROM run AS actor
 COPY --from=build-actor /opt/daedalus /opt/daedalus
 # An actor uses one core. Thread pools of its libraries would take time on the cores of other processes.
 ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
+
+
+# A gateway plays, too, for the camera of its page: it is an actor with a web server.
+FROM build-actor AS build-gateway
+RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir --require-hashes \
+        -r deploy/requirements/gateway.txt \
+    && python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt \
+        "$(echo /wheels/*.whl)[gateway]"
+
+FROM run AS gateway
+COPY --from=build-gateway /opt/daedalus /opt/daedalus
 
 
 FROM build AS build-learner

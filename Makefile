@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs docs-reference check format lock clean
+.PHONY: train test test-core test-trackio test-compose examples screenshots attack fuzz mutants docs docs-reference check format lock clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -12,6 +12,22 @@ train: .venv/ready-train
 # first. The tests of one file run in one process, because they share what they start.
 test: check
 	$(BIN)/pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder
+
+# The mathematics, the wire, the learner and runs with real processes, in an environment of their own. With the oldest
+# releases that pyproject.toml allows:
+#
+#   make test-core CONSTRAINTS=constraints-lowest.txt TORCH=torch==2.9
+CONSTRAINTS ?= constraints.txt
+TORCH ?= torch==2.13.0
+CORE_EXTRAS = learner certs gateway monitoring analysis pettingzoo
+CORE = tests/algorithms tests/policy tests/protocol tests/transport tests/simulation tests/learner \
+	tests/end_to_end/test_in_one_process.py tests/end_to_end/test_router.py
+test-core:
+	$(PYTHON) -m venv build/core
+	build/core/bin/pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) $(TORCH)
+	build/core/bin/pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) \
+		-e ".[$(shell echo $(CORE_EXTRAS) | tr ' ' ,)]" pytest pytest-xdist hypothesis jsonschema pyyaml
+	build/core/bin/pytest --numprocesses 6 --dist loadfile $(CORE)
 
 # Trackio needs an older pillow than constraints.txt: for its test it is installed into a folder of its own.
 test-trackio: .venv/ready-test
@@ -95,6 +111,9 @@ docs-reference: .venv/ready-train
 # build or a CUDA build, with other requirements, under the same version.
 LOCK = $(BIN)/uv pip compile --quiet --python-version 3.11 -c constraints.txt --generate-hashes \
 	--no-annotate --custom-compile-command "make lock" --overrides build/without-torch.txt
+# The oldest releases that pyproject.toml allows, each with the newest packages that it requires in turn.
+LOWEST = $(BIN)/uv pip compile --quiet --python-version 3.11 --resolution lowest-direct --upgrade --no-annotate \
+	--custom-compile-command "make lock" --overrides build/without-torch.txt
 lock: .venv/ready-train
 	$(PIP) uv
 	mkdir -p build
@@ -102,6 +121,9 @@ lock: .venv/ready-train
 	$(LOCK) pyproject.toml --extra box2d --extra monitoring -o deploy/requirements/actor.txt >/dev/null
 	$(LOCK) pyproject.toml --extra learner --extra plot --extra certs --extra monitoring --extra gateway --extra box2d \
 		-o deploy/requirements/learner.txt >/dev/null
+	$(LOCK) pyproject.toml --extra gateway -o deploy/requirements/gateway.txt >/dev/null
+	printf 'uv\n' | $(LOCK) - -o deploy/requirements/release.txt >/dev/null
+	$(LOWEST) pyproject.toml $(CORE_EXTRAS:%=--extra %) -o constraints-lowest.txt >/dev/null
 	printf 'build\nsetuptools\n' | $(LOCK) - -o deploy/requirements/build.txt >/dev/null
 
 clean:

@@ -240,6 +240,10 @@ class Client:
         """See ClientAgent.end_episode: this is the first agent."""
         self.agents[0].end_episode(terminated=terminated, observation=observation)
 
+    def success(self, reward: float = 1.0, observation: Any = None) -> None:
+        """See ClientAgent.success: this is the first agent."""
+        self.agents[0].success(reward, observation)
+
     @property
     def dropped(self) -> int:
         """How many rollouts, finished or not, were dropped because the learner was away or accepted none for long."""

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.batch import Batch, Pass
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.forward import Forward
 from daedalus.algorithms.minibatches import Minibatch
@@ -84,6 +84,15 @@ class Algorithm:
           forward: the network.
         """
         raise NotImplementedError
+
+    def drawn(self, valid: Tensor, *, has_memory: bool) -> list[Pass]:
+        """Return what is random in the updates of a batch, drawn on the CPU: `batch.passes` of `losses`.
+
+        Args:
+          valid: [T, B] float32 on the CPU, 1 for the rows to learn from.
+          has_memory: whether the policy has a memory.
+        """
+        return []
 
     def after_update(self, policy_version: int, forward: Forward) -> None:
         """Do what follows an update, such as changing the target network. Only the learner calls this method.

@@ -1,7 +1,6 @@
 """The network as an algorithm uses it: forward passes, and the target network."""
 
 import copy
-import math
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 
@@ -29,19 +28,18 @@ class FlatParameters:
             parameter.data = self.values[start:end].view_as(parameter)
             start = end
 
-    def differentiated(self, loss: Tensor) -> Tensor:
-        """Return the gradients of a loss [P]; 0 for a parameter that it does not depend on."""
+    def differentiated(self, loss: Tensor, out: Tensor | None = None) -> Tensor:
+        """Return the gradients of a loss [P], in `out` if given; 0 for a parameter that it does not depend on."""
         gradients = torch.autograd.grad(loss, self._parameters, materialize_grads=True)
-        return torch.cat([gradient.flatten() for gradient in gradients])
+        return torch.cat([gradient.flatten() for gradient in gradients], out=out)
 
-    def clip_gradients(self, max_norm: float) -> float:
-        """Scale the gradients so that their norm is at most `max_norm`; return their norm before scaling.
+    def clip_gradients(self, max_norm: float) -> Tensor:
+        """Scale the gradients so that their norm is at most `max_norm`; return their norm before, a scalar.
 
-        Gradients whose norm is not finite are left as they are.
+        No value is read. Gradients whose norm is not finite stay without use.
         """
-        norm = float(torch.linalg.vector_norm(self.gradients))
-        if max_norm < norm < math.inf:
-            self.gradients.mul_(max_norm / (norm + 1e-6))
+        norm = torch.linalg.vector_norm(self.gradients)
+        self.gradients.mul_((max_norm / (norm + 1e-6)).clamp_(max=1.0))
         return norm
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -52,6 +52,20 @@ class Terms(NamedTuple):
     clipped_fraction: Tensor
 
 
+class Then(Protocol):
+    """What follows each gradient of a batch, as operations on tensors that read no value."""
+
+    changed: Sequence[Tensor]  # what `clip` changes in place, besides the gradient
+
+    def clip(self, terms: Terms) -> None:
+        """Clip the gradient. It may be recorded with the computation of the gradient."""
+        ...
+
+    def apply(self) -> None:
+        """Apply the gradient. TorchScript would leave out the kernel of an optimiser, which has no result."""
+        ...
+
+
 class GradientComputer:
     """Gradient computation of one algorithm for one network."""
 
@@ -82,44 +96,53 @@ class GradientComputer:
             )
             self._first_pass = None
 
-    def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
+    def compute(self, batch: Batch, entropy_bonus: float | Tensor, then: Then | None = None) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
 
-        The caller applies the gradient before it asks for the next update.
+        Without `then`, the caller applies the gradient before it asks for the next update.
+
+        Args:
+          batch: on the device of the parameters.
+          entropy_bonus: weight of the entropy in the loss; a number, or a scalar on the device.
+          then: what follows each gradient.
         """
         # The statistics of observations do not change within a batch: prepare them once for all passes.
         batch = replace(batch, observations=self._network.prepare(batch.observations))
-        bonus = torch.tensor(entropy_bonus, device=batch.valid.device)
+        bonus = torch.as_tensor(entropy_bonus, device=batch.valid.device)
         for losses in self.algorithm.losses(batch, self.forward):
             if not isinstance(losses, Losses | MinibatchLosses):
                 raise TypeError(f"losses() gives {type(losses).__name__}: it must yield Losses or MinibatchLosses")
             self._first_pass = losses.first_pass
             if isinstance(losses, MinibatchLosses):
-                gradient, *terms = self._of_minibatch(losses, bonus)
+                terms = Terms(*self._of_minibatch(losses, bonus, then))
             else:
-                gradient, *terms = self._differentiated(losses, bonus)
-            self.parameters.gradients.copy_(gradient)
-            yield Terms(*terms)
+                terms = Terms(*self._differentiated(losses, bonus, then))
+            if then is not None:
+                then.apply()
+            yield terms
 
     def no_update(self) -> Terms:
         """Write a gradient of 0 and return terms of 0: for a batch of which an own algorithm makes no update."""
         self.parameters.gradients.zero_()
         return Terms(*self.parameters.gradients.new_zeros(len(Terms._fields)))
 
-    def _of_minibatch(self, losses: MinibatchLosses, bonus: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradient [P] and the terms of the losses of a minibatch, by a recording if it is worth one."""
+    def _of_minibatch(self, losses: MinibatchLosses, bonus: Tensor, then: Then | None) -> tuple[Tensor, ...]:
+        """Return the terms of the losses of a minibatch, by a recording if it is worth one. See `compute`."""
         function, minibatch, _ = losses
         if not (self._records and len(minibatch.shares) <= _MOST_ROWS):
-            return self._differentiated(function(minibatch, self.forward), bonus)
+            return self._differentiated(function(minibatch, self.forward), bonus, then)
 
-        def gradient(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        def update(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
             *parts, bonus = tensors
-            return self._differentiated(function(minibatch.with_tensors(parts), self.forward), bonus)
+            return self._differentiated(function(minibatch.with_tensors(parts), self.forward), bonus, then)
 
-        return self._recorder.call((function, *minibatch.names), gradient, [*minibatch.tensors(), bonus])
+        changed = [self.parameters.gradients, *(() if then is None else then.changed)]
+        # The spaces, and the number of rows and environments, decide the shapes of everything else.
+        name = (function, then is None, minibatch.shares.shape)
+        return self._recorder.call(name, update, [*minibatch.tensors(), bonus], changed, tells_shapes=True)
 
-    def _differentiated(self, losses: Losses, bonus: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradient [P] of the weighted sum of losses, and their Terms."""
+    def _differentiated(self, losses: Losses, bonus: Tensor, then: Then | None) -> tuple[Tensor, ...]:
+        """Write the gradient [P] of the weighted sum of losses. Return their Terms."""
         _check_shapes(losses)
         value_term = losses.value_loss
         if value_term is None:
@@ -128,7 +151,10 @@ class GradientComputer:
         loss = losses.policy_loss + self._spec.value_coefficient * value_term - bonus * entropy
         clipped = entropy.new_zeros(()) if losses.clipped_fraction is None else losses.clipped_fraction
         terms = Terms(losses.policy_loss.detach(), value_term.detach(), entropy.detach(), clipped)
-        return self.parameters.differentiated(loss), *terms
+        self.parameters.differentiated(loss, out=self.parameters.gradients)
+        if then is not None:
+            then.clip(terms)
+        return terms
 
     def take_first_pass(self) -> FirstPass | None:
         """Return the first pass of the newest batch, once; None without a batch since the last call.

@@ -4,13 +4,14 @@
 once for all terms, because small networks learn as fast as few operations are made.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss, mse_loss
 
 from daedalus.algorithms.returns import Targets
+from daedalus.protocol.spec import LossSpec
 
 _ROUNDING = 1e-4  # a deviation below this share of the mean may be only the rounding of float32
 _NEGLIGIBLE = 1e-6  # a variance of the targets below this share of their mean square: they are equal
@@ -27,25 +28,28 @@ def mean(values: Tensor, shares: Tensor) -> Tensor:
     return values.flatten().dot(shares.flatten())
 
 
-def normalized(advantages: Tensor, valid: Tensor) -> Tensor:
+def normalized(advantages: Tensor, valid: Tensor, least: float = 0.0) -> Tensor:
     """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows.
 
-    The deviation is less than 1 where the advantages are equal except for rounding. `valid` [T, B] is 1 or 0.
+    The deviation is less than 1 where the advantages are equal except for rounding, or theirs is less than `least`.
+    `valid` [T, B] is 1 or 0.
     """
     # Not by shares, whose rounding would make equal advantages differ from 0.
     number = valid.sum().clamp(min=1.0)
     average = (advantages * valid).sum() / number
     centred = advantages - average
     deviation = ((centred.square() * valid).sum() / number).sqrt()
-    return centred / (deviation.maximum(_ROUNDING * average.abs()) + 1e-8)
+    return centred / (deviation.maximum(_ROUNDING * average.abs()).clamp(min=least) + 1e-8)
 
 
-def policy_factors(targets: Targets, valid: Tensor, normalize: bool) -> Tensor:
+def policy_factors(spec: LossSpec, targets: Targets, valid: Tensor) -> Tensor:
     """Return w_t A_t [T, B], the factor of row t in the policy loss, with A_t normalised over the valid rows if asked.
 
     A_t is normalised before it is weighted: normalised after, a row with weight 0 would get -mean / std.
     """
-    return targets.weights * (normalized(targets.advantages, valid) if normalize else targets.advantages)
+    if not spec.normalize_advantages:
+        return targets.weights * targets.advantages
+    return targets.weights * normalized(targets.advantages, valid, spec.min_advantage_deviation)
 
 
 def policy_gradient_loss(log_probs: Tensor, factors: Tensor, shares: Tensor) -> Tensor:
@@ -72,14 +76,32 @@ def clipped_policy_loss(
       shares: [T, B].
       clip_range: c.
     """
-    ratios = log_ratios.clamp(max=_MAX_LOG_RATIO).exp()
-    with torch.no_grad():  # the gradient of a minimum would take many operations
+    loss, clipped_share = _ClippedLoss.apply(log_ratios, factors, shares, clip_range)  # pyright: ignore
+    return loss, clipped_share
+
+
+class _ClippedLoss(torch.autograd.Function):
+    """Forward and backward pass of `clipped_policy_loss`; those that autograd derives take twice as many operations."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, log_ratios: Tensor, factors: Tensor, shares: Tensor, clip_range: float
+    ) -> tuple[Tensor, Tensor]:
+        ratios = log_ratios.clamp(max=_MAX_LOG_RATIO).exp()
         clipped = ratios.clamp(1.0 - clip_range, 1.0 + clip_range)
-        gains, clipped_gains = ratios * factors, clipped * factors
-        moving = factors * (gains <= clipped_gains)  # the factors of the rows that have a gradient
-        constant = mean(gains.minimum(clipped_gains) - ratios * moving, shares)
+        gains = ratios * factors
+        lower = gains.minimum(clipped * factors)
+        # The rows that have a gradient: those whose ratio is not clipped, for which it is also that of the logarithm.
+        without = (gains > lower) | (log_ratios > _MAX_LOG_RATIO)
+        ctx.save_for_backward((gains * shares).masked_fill_(without, 0.0))
         clipped_share = mean((ratios != clipped).to(shares.dtype), shares)
-    return -mean(ratios * moving, shares) - constant, clipped_share
+        ctx.mark_non_differentiable(clipped_share)
+        return -mean(lower, shares), clipped_share
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
+        (rows,) = ctx.saved_tensors
+        return -gradients[0] * rows, None, None, None
 
 
 def value_loss(values: Tensor, targets: Tensor, shares: Tensor, kind: Literal["mse", "huber"]) -> Tensor:
@@ -98,7 +120,7 @@ def explained_variance(values: Tensor, targets: Tensor, shares: Tensor) -> Tenso
     """
     spread = variance(targets, shares)
     differ = spread > _NEGLIGIBLE * mean(targets.square(), shares)
-    return torch.where(differ, 1.0 - variance(targets - values, shares) / spread, torch.nan)
+    return (1.0 - variance(targets - values, shares) / spread).masked_fill(~differ, torch.nan)
 
 
 def variance(values: Tensor, shares: Tensor) -> Tensor:

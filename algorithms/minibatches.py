@@ -8,7 +8,7 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.batch import Batch, Pass
 from daedalus.algorithms.losses import shares_of
 from daedalus.policy.network.layers import Components, map_components
 
@@ -33,11 +33,6 @@ class Minibatch:
     factors: Tensor  # [R, B], of the rows in the policy loss
     shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
 
-    @property
-    def names(self) -> tuple[tuple[str, ...], ...]:
-        """The names of the components of each map, in the order of the fields."""
-        return tuple(tuple(getattr(self, name)) for name in _MAPS)
-
     def tensors(self) -> list[Tensor]:
         """Return all tensors of the minibatch, in the order of the fields."""
         maps = (getattr(self, name).values() for name in _MAPS)
@@ -54,10 +49,8 @@ _MAPS = ("observations", "actions", "masks")
 _ARRAYS = ("initial_state", "starts", "log_probs", "values", "targets", "factors", "shares")
 
 
-def minibatches(
-    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, count: int
-) -> Iterator[Minibatch]:
-    """Return one shuffled pass over a batch as `count` minibatches of nearly equal size.
+def draw_pass(valid: Tensor, count: int, *, has_memory: bool) -> Pass:
+    """Draw the minibatches of one pass over a batch on the CPU: a device then waits for no number of rows.
 
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
     is split into single rows, and reset rows are omitted. A batch with fewer parts than `count` makes as many
@@ -65,21 +58,49 @@ def minibatches(
     are missing are filled up by a copy of another row whose share is 0.
 
     Args:
+      valid: [T, B] float32 on the CPU, 1 for the rows to learn from.
+      count: largest number of minibatches.
+      has_memory: whether the policy has one.
+    """
+    if has_memory:
+        return Pass(torch.randperm(valid.shape[1]), valid.new_zeros(0))
+    rows = valid.flatten().nonzero().squeeze(1)  # [N]
+    order = rows[torch.randperm(len(rows))]
+    number = min(count, len(order))
+    if not number:
+        return Pass(rows.new_zeros((0, 1)), valid.new_zeros((0, 1)))
+    split = order.tensor_split(number)
+    size = -(-valid.numel() // number)
+    shares = valid.new_zeros((number, size))
+    for row, part in zip(shares, split, strict=True):
+        row[: len(part)] = 1.0 / len(part)
+    return Pass(torch.stack([_filled_up(part, size) for part in split]), shares)
+
+
+def minibatches(
+    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, count: int, drawn: Pass
+) -> Iterator[Minibatch]:
+    """Return one shuffled pass over a batch as `count` minibatches of nearly equal size.
+
+    Args:
       log_probs: [T, B], log-probabilities of the actions under the proximal policy.
       values: [T, B], of the network before the first pass.
       targets: [T, B], value targets.
       factors: [T, B], of the rows in the policy loss.
       count: largest number of minibatches.
+      drawn: result of `draw_pass`, with the same `count`, on the device of the batch.
     """
-    split = _by_environment if batch.initial_state.shape[1] else _by_row
-    return split(batch, log_probs, values, targets, factors, count)
+    if batch.initial_state.shape[1]:
+        return _by_environment(
+            batch, log_probs, values, targets, factors, drawn.parts.tensor_split(min(count, len(drawn.parts)))
+        )
+    return _by_row(batch, log_probs, values, targets, factors, drawn)
 
 
 def _by_environment(
-    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, count: int
+    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, parts: Sequence[Tensor]
 ) -> Iterator[Minibatch]:
-    order = torch.randperm(batch.valid.shape[1]).to(batch.valid.device)
-    for part in order.tensor_split(min(count, len(order))):
+    for part in parts:
         yield Minibatch(
             observations=map_components(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
             initial_state=batch.initial_state[part],
@@ -95,18 +116,10 @@ def _by_environment(
 
 
 def _by_row(
-    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, count: int
+    batch: Batch, log_probs: Tensor, values: Tensor, targets: Tensor, factors: Tensor, drawn: Pass
 ) -> Iterator[Minibatch]:
-    rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
-    order = rows[torch.randperm(len(rows)).to(rows.device)]
-    number = min(count, len(order))
-    if not number:
-        return
-    split = order.tensor_split(number)
-    size = -(-batch.valid.numel() // number)
-    filled = [_filled_up(part, size) for part in split]
-    order = torch.cat(filled)
-    shares = {length: _equal_shares(batch.valid, length, size) for length in {len(part) for part in split}}
+    number, size = drawn.parts.shape
+    order = drawn.parts.flatten()
     state = batch.initial_state.new_zeros((size, 0))
 
     def parts_of(values: Tensor) -> tuple[Tensor, ...]:
@@ -123,9 +136,10 @@ def _by_row(
     actions = {name: parts_of(values) for name, values in batch.actions.items()}
     masks = {name: parts_of(values) for name, values in batch.masks.items()}
     arrays = [parts_of(values) for values in (batch.starts, log_probs, values, targets, factors)]
-    for index, part in enumerate(filled):
+    shares = drawn.shares.unsqueeze(1)  # [M, 1, N]
+    for index in range(number):
         starts, own_log_probs, own_values, own_targets, own_factors = (parts[index] for parts in arrays)
-        gathered = map_components(large, partial(_rows, rows=part))
+        gathered = map_components(large, partial(_rows, rows=drawn.parts[index]))
         yield Minibatch(
             observations={name: parts[index] for name, parts in small.items()} | gathered,
             initial_state=state,
@@ -136,20 +150,13 @@ def _by_row(
             values=own_values,
             targets=own_targets,
             factors=own_factors,
-            shares=shares[len(split[index])],
+            shares=shares[index],
         )
 
 
 def _filled_up(rows: Tensor, size: int) -> Tensor:
     """Return the numbers of rows, and copies of the first so that there are `size`."""
     return torch.cat([rows, rows[:1].expand(size - len(rows))])
-
-
-def _equal_shares(like: Tensor, rows: int, size: int) -> Tensor:
-    """Return the shares [1, size] of a minibatch whose first rows count, each as much, and the others nothing."""
-    shares = like.new_zeros((1, size))
-    shares[:, :rows] = 1.0 / rows
-    return shares
 
 
 def _columns(values: Tensor, part: Tensor, rows: int | None = None) -> Tensor:

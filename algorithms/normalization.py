@@ -444,6 +444,12 @@ class ObservationStatistics:
             ranges.merge(observations_name(name), parts[name], moments)
             self._normalizer.set_statistics(name, moments.mean, moments.variance)
 
+    def add(self, observations: Mapping[str, Tensor]) -> None:
+        """Add observations that nobody doubts, by component [N, *stacked_shape], and set the statistics."""
+        for name, moments in self.moments.items():
+            moments.merge(moments_of(observations[name]))
+            self._normalizer.set_statistics(name, moments.mean, moments.variance)
+
     def reset(self) -> None:
         """Forget all observations."""
         for name, moments in self.moments.items():

@@ -65,7 +65,8 @@ def check_updates(
 
     Raises AlgorithmError.
     """
-    batch = BatchAssembler(spaces, torch.device("cpu")).allocate(_ROWS, _ENVIRONMENTS, state_size)
+    device = torch.device("cpu")
+    batch = BatchAssembler(spaces, device).allocate(_ROWS, _ENVIRONMENTS, state_size).to(device)
     map_components(batch.masks, lambda mask: mask.fill_(True))
     batch.valid.fill_(1.0)
     expected = spec.updates_from(_ENVIRONMENTS if state_size else _ROWS * _ENVIRONMENTS)

@@ -1,15 +1,16 @@
 """The algorithms that follow the gradient of the policy: a2c, a3c and impala with one update a batch, and appo."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from daedalus.algorithms.algorithm import Algorithm, Forward, Losses, MinibatchLosses
-from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.batch import Batch, Pass
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.losses import clipped_policy_loss, policy_factors, policy_gradient_loss, shares_of
-from daedalus.algorithms.minibatches import Minibatch, minibatches
+from daedalus.algorithms.minibatches import Minibatch, draw_pass, minibatches
 from daedalus.algorithms.returns import Targets, lambda_targets, vtrace_corrected_targets
 from daedalus.protocol.algorithms import ALGORITHMS
 
@@ -28,7 +29,7 @@ class PolicyGradient(Algorithm):
         with torch.no_grad():
             targets = self.targets(batch, log_probs, values)
             shares = shares_of(batch.valid)
-            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages)
+            factors = policy_factors(self.spec, targets, batch.valid)
         yield Losses(
             policy_loss=policy_gradient_loss(log_probs, factors, shares),
             entropies=entropies,
@@ -95,15 +96,22 @@ class Appo(Algorithm):
             parameters, values = forward(batch.observations, batch.initial_state, batch.starts)
             log_probs = self.distribution.log_prob(parameters[:-1], batch.actions, batch.masks)
             targets = lambda_targets(self.spec, batch, log_probs, values)
-            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages)
+            factors = policy_factors(self.spec, targets, batch.valid)
         first_pass = FirstPass(
             log_probs, batch.behaviour_log_probs, values[:-1], targets.values, targets.advantages, batch.valid
         )
         behaviour = self.spec.proximal_policy == "behaviour" and not self.spec.explores
         proximal = batch.behaviour_log_probs if behaviour else log_probs
-        for _ in range(self.spec.passes):
-            for minibatch in minibatches(batch, proximal, values[:-1], targets.values, factors, self.spec.minibatches):
+        of_rows = batch, proximal, values[:-1], targets.values, factors
+        for drawn in batch.passes or self.drawn(batch.valid.cpu(), has_memory=batch.initial_state.shape[1] > 0):
+            drawn = Pass(*(part.to(batch.valid.device) for part in drawn))
+            for minibatch in minibatches(*of_rows, self.spec.minibatches, drawn):
                 yield MinibatchLosses(self._minibatch_losses, minibatch, first_pass)
+
+    def drawn(self, valid: Tensor, *, has_memory: bool) -> list[Pass]:
+        """See Algorithm."""
+        draw = partial(draw_pass, valid, self.spec.minibatches, has_memory=has_memory)
+        return [draw() for _ in range(self.spec.passes)]
 
     def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:
         parameters, values = forward(minibatch.observations, minibatch.initial_state, minibatch.starts)

@@ -196,30 +196,47 @@ class OperationRecorder:
         self._calls = 0
         self._can_record = True
 
-    def call(self, name: Hashable, function: Function, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    def call(
+        self,
+        name: Hashable,
+        function: Function,
+        tensors: Sequence[Tensor],
+        changed: Sequence[Tensor] = (),
+        *,
+        tells_shapes: bool = False,
+    ) -> tuple[Tensor, ...]:
         """Return the results of a function, without gradients.
 
         Args:
           name: of the function: functions with the same name do the same operations.
           function: it may compute gradients.
           tensors: its arguments.
+          changed: other tensors that it changes in place, which it may use.
+          tells_shapes: whether the name differs for other shapes and types of tensors, so that they are not looked at.
         """
-        key = (name, *((each.shape, each.dtype) for each in tensors))
+        key = (name,) if tells_shapes else (name, *((each.shape, each.dtype) for each in tensors))
         recording = self._recordings.get(key)
         if recording is not None:
             return _repeated(recording, tensors)
         self._calls += 1
+        is_due = self._calls > EARLIER_CALLS and len(self._recordings) < _LARGEST_NUMBER and self._can_record
+        before = [each.clone() for each in changed] if is_due else []
         results = tuple(each.detach() for each in function(tensors))
-        is_due = self._calls > EARLIER_CALLS and len(self._recordings) < _LARGEST_NUMBER
-        if not (is_due and self._can_record and all(map(_is_finite, results))):
+        if not (is_due and all(map(_is_finite, (*results, *changed)))):
             return results
+        after = [each.clone() for each in changed]
         try:
+            _set(changed, before)
             recording = _recording(function, tensors)
+            _set(changed, before)
             repeated = _repeated(recording, tensors)
         except Exception as error:  # torch raises whatever its tracer meets
             return self._refuse(first_line(error), results)
-        if not all(map(_are_close, repeated, results)):
-            return self._refuse("the recording gives other results", results)
+        else:
+            if not all(map(_are_close, (*repeated, *changed), (*results, *after))):
+                return self._refuse("the recording gives other results", results)
+        finally:
+            _set(changed, after)
         self._recordings[key] = recording
         return results
 
@@ -243,6 +260,12 @@ def _recording(function: Function, tensors: Sequence[Tensor]) -> Recording:
         warnings.simplefilter("ignore")
         program: Any = torch.jit.trace(repeat, (*tensors, *others), check_trace=False)
     return lambda *values: program(*values, *others)
+
+
+def _set(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> None:
+    with torch.no_grad():
+        for tensor, value in zip(tensors, values, strict=True):
+            tensor.copy_(value)
 
 
 def _is_finite(values: Tensor) -> bool:

@@ -45,8 +45,8 @@ class ReplayBuffer:
 
     A frame is stored once for its column, and stacked when it is sampled. The oldest column makes room for a new one,
     with all its rows. A transition does not go beyond its column: its target bootstraps at the last row at the latest.
-    Neither does it go beyond the end of an episode, nor beyond a row before one that is overridden, whose action is not
-    the policy's: the target bootstraps there. Reset rows and overridden rows are never sampled.
+    Neither does it go beyond the end of an episode, nor from the policy's rows into overridden ones or back: the target
+    bootstraps there. Reset rows are never sampled, and overridden rows by `sample_taught` alone, if they teach.
     """
 
     def __init__(self, spaces: Spaces, rollout_length: int, capacity: int) -> None:
@@ -72,15 +72,12 @@ class ReplayBuffer:
             "terminated": np.zeros(cells, np.bool_),
             "ends": np.zeros(cells, np.bool_),  # the target of the row bootstraps from the next observation
             "learned": np.zeros(cells, np.bool_),
+            "taught": np.zeros(cells, np.bool_),
             # Of each observation: how many frames before it are of its episode, at most those in a stack.
             "ages": np.zeros((self.columns, rollout_length + 1), np.uint8),
         }
         self._most_frames = max(self._depths.values())
-        self._indices = np.arange(self.columns * rollout_length).reshape(cells)
-        # The rows to learn from, oldest first: columns come and go in order, and with them their rows.
-        self._queue = np.zeros(self.columns * rollout_length, np.int64)
-        self._first = self._last = 0  # of the queue, counted over all rows that ever were in it
-        self._counts = np.zeros(self.columns, np.int64)  # rows to learn from in each column
+        self._queues = {name: _Rows(cells) for name in ("learned", "taught")}
         self.columns_added = 0  # ever
 
     @property
@@ -91,16 +88,22 @@ class ReplayBuffer:
     @property
     def rows_added(self) -> int:
         """Rows to learn from that were ever added."""
-        return self._last
+        return self._queues["learned"].added
 
     def __len__(self) -> int:
         """Return the number of transitions that can be sampled."""
-        return self._last - self._first
+        return len(self._queues["learned"])
+
+    @property
+    def taught(self) -> int:
+        """Number of transitions that `sample_taught` draws from."""
+        return len(self._queues["taught"])
 
     def add(self, rollout: Rollout) -> None:
         """Add all columns of a rollout, or its last ones if it has more than the buffer."""
         ends = rollout.terminated | rollout.truncated  # [T, E]
-        ends[:-1] |= ~rollout.learned[1:]
+        taught = np.zeros_like(ends) if rollout.taught is None else rollout.taught & rollout.valid
+        ends[:-1] |= ~((rollout.learned[:-1] & rollout.learned[1:]) | (taught[:-1] & taught[1:]))
         rows = {
             **{f"frames/{name}": frames for name, frames in rollout.frames.items()},
             "actions": np.concatenate([rollout.actions[name] for name in self._action_names], -1),
@@ -108,6 +111,7 @@ class ReplayBuffer:
             "terminated": rollout.terminated,
             "ends": ends,
             "learned": rollout.learned,
+            "taught": taught,
             "ages": self._ages_of(rollout.valid),
         }
         self.add_columns({name: values.swapaxes(0, 1) for name, values in rows.items()})
@@ -122,16 +126,12 @@ class ReplayBuffer:
     def add_columns(self, arrays: dict[str, np.ndarray]) -> None:
         """Add columns, or the last ones if they are more than the buffer has: each array [columns, ...] of `copied`."""
         arrays = {name: values[-self.columns :] for name, values in arrays.items()}
-        learned = arrays["learned"]
-        at = (self.columns_added + np.arange(len(learned))) % self.columns
-        self._first += int(self._counts[at].sum())
+        at = (self.columns_added + np.arange(len(arrays["learned"]))) % self.columns
         for name, values in arrays.items():
             self._arrays[name][at] = values
-        self._counts[at] = learned.sum(1)
-        new = self._indices[at][learned]
-        self._queue[(self._last + np.arange(len(new))) % len(self._queue)] = new
-        self._last += len(new)
-        self.columns_added += len(learned)
+        for name, queue in self._queues.items():
+            queue.replace(at, arrays[name])
+        self.columns_added += len(at)
 
     def copied(self, first: int, last: int) -> dict[str, np.ndarray]:
         """Return copies of the columns `first` to `last` - 1, counted over all that ever were added; each is held."""
@@ -149,8 +149,11 @@ class ReplayBuffer:
 
             rewards = sum_{i < m} discount_factor^i r_{t+i},  discounts = discount_factor^m (1 - terminated_{t+m-1})
         """
-        drawn = torch.randint(len(self), (count,)).numpy()
-        return self.transitions(self._queue[(self._first + drawn) % len(self._queue)], n_step, discount_factor)
+        return self.transitions(self._queues["learned"].drawn(count), n_step, discount_factor)
+
+    def sample_taught(self, count: int, n_step: int, discount_factor: float) -> Transitions:
+        """Return transitions of rows whose actions somebody else played, to learn from; as `sample`."""
+        return self.transitions(self._queues["taught"].drawn(count), n_step, discount_factor)
 
     def transitions(self, indices: np.ndarray, n_step: int, discount_factor: float) -> Transitions:
         """Return the transitions of some rows, [B] indices of those in `learned_rows`; for the rest see `sample`."""
@@ -175,12 +178,17 @@ class ReplayBuffer:
     @property
     def nbytes(self) -> int:
         """Memory that the full buffer takes, in bytes."""
-        return sum(values.nbytes for values in (*self._arrays.values(), self._queue))
+        return sum(values.nbytes for values in self._arrays.values()) + 8 * self.capacity  # and the queue of its rows
 
     @property
     def learned_rows(self) -> np.ndarray:
         """Indices of all rows that can be sampled, oldest first."""
-        return self._queue[np.arange(self._first, self._last) % len(self._queue)]
+        return self._queues["learned"].rows
+
+    @property
+    def taught_rows(self) -> np.ndarray:
+        """Indices of all rows that `sample_taught` draws from, oldest first."""
+        return self._queues["taught"].rows
 
     def _observations(self, columns: np.ndarray, rows: np.ndarray) -> Components:
         """Return the observations of rows, with their stacks."""
@@ -196,3 +204,33 @@ class ReplayBuffer:
                 values = frames[columns[:, None], newest[:, None] - back]
             found[name] = torch.from_numpy(values.astype(np.int64) if name in self._discrete else values)
         return found
+
+
+class _Rows:
+    """Rows of one kind, oldest first, by index: columns come and go in order, and with them their rows."""
+
+    def __init__(self, cells: tuple[int, int]) -> None:
+        """`cells`: columns and rows of the buffer. The system gives the memory when it is first written to."""
+        columns, self._length = cells
+        self._queue = np.zeros(columns * self._length, np.int64)
+        self._first = self.added = 0  # counted over all rows that ever were in it
+        self._counts = np.zeros(columns, np.int64)  # in each column
+
+    def __len__(self) -> int:
+        return self.added - self._first
+
+    def replace(self, at: np.ndarray, chosen: np.ndarray) -> None:
+        """Replace the rows of some columns by those that are chosen, [columns, T] bool."""
+        self._first += int(self._counts[at].sum())
+        self._counts[at] = chosen.sum(1)
+        places, rows = np.nonzero(chosen)
+        self._queue[(self.added + np.arange(len(rows))) % len(self._queue)] = at[places] * self._length + rows
+        self.added += len(rows)
+
+    def drawn(self, count: int) -> np.ndarray:
+        """Return rows that are drawn uniformly, with torch's random numbers."""
+        return self._queue[(self._first + torch.randint(len(self), (count,)).numpy()) % len(self._queue)]
+
+    @property
+    def rows(self) -> np.ndarray:
+        return self._queue[np.arange(self._first, self.added) % len(self._queue)]

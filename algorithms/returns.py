@@ -114,11 +114,20 @@ def vtrace_targets(
 
 
 def _accumulate(constants: Tensor, factors: Tensor, last: Tensor) -> Tensor:
-    """Solve x_t = constants_t + factors_t x_{t+1} backwards from x_T = last. [T, B], [T, B], [B] -> [T, B]."""
-    result, following = constants.clone(), last
-    for row, factor in zip(reversed(result.unbind()), reversed(factors.unbind()), strict=True):
-        following = row.addcmul_(factor, following)
-    return result
+    """Solve x_t = constants_t + factors_t x_{t+1} backwards from x_T = last. [T, B], [T, B], [B] -> [T, B].
+
+    It takes about log2(T) steps, each of which doubles the rows that x_t depends on: x -> c + f x after x -> c' + f' x
+    is x -> (c + f c') + f f' x. Row by row it would be T operations, which cost a GPU as much as large ones.
+    """
+    constants, factors = constants.clone(), factors.clone()
+    constants[-1].addcmul_(factors[-1], last)
+    factors[-1].zero_()
+    span, rows = 1, len(constants)
+    while span < rows:
+        constants = torch.cat([torch.addcmul(constants[:-span], factors[:-span], constants[span:]), constants[-span:]])
+        factors = torch.cat([factors[:-span] * factors[span:], factors[-span:]])
+        span *= 2
+    return constants
 
 
 def lambda_targets(spec: LossSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:

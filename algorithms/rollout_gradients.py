@@ -86,7 +86,7 @@ class RolloutGradients:
 
         Rewards are normalised as the learner would: with the statistics of the snapshot and of the rollout itself.
         """
-        batch = self._assembler.join([rollout])
+        batch = self._assembler.join([rollout]).to(torch.device("cpu"))
         moments = {observations_name(name): part for name, part in self._observations.moments_of(batch).items()}
         if self._rewards is not None:
             moments["returns"] = self._rewards.moments_of([rollout])

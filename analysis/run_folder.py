@@ -23,10 +23,10 @@ from daedalus.analysis.recorded_run import (
 )
 from daedalus.analysis.run_archive import listed, module_names, parts_of
 from daedalus.analysis.run_selection import Labels, read_labels
-from daedalus.learner.run.run_directory import VERSIONS
+from daedalus.learner.run.run_directory import VERSIONS, read_config, releases_of
 from daedalus.learner.run.run_files import RunDataError, read_json
 from daedalus.learner.run.run_lock import RunInUseError, is_locked, lock_idle
-from daedalus.learner.run.settings import value_text
+from daedalus.learner.run.settings import SettingsError, value_text
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.protocol.texts import bounded_text, short_number
@@ -59,7 +59,8 @@ class RunEntry:
     settings: Mapping[str, Any]  # by `section.key`; empty if they cannot be read
     run: RecordedRun | None  # None if it has no metrics yet, or cannot be read
     problem: str  # why it cannot be read; empty if it can
-    release: str  # of daedalus-rl that made it; empty if it is not known
+    made_by: str  # release of daedalus-rl; empty if it is not known
+    written_by: str  # release that wrote its settings last
     size: int  # bytes that its removal would free
     is_running: bool
 
@@ -120,7 +121,8 @@ class RunEntry:
 
 def read_entry(directory: Path) -> RunEntry:
     """Return what a run directory says, also of one that is damaged, or has nothing yet."""
-    run, settings, labels, problems, release = None, dict[str, Any](), Labels(), list[str](), ""
+    run, settings, labels, problems = None, dict[str, Any](), Labels(), list[str]()
+    made_by = written_by = ""
     try:
         settings = read_run_settings(directory)
         with suppress(NoMetricsError):
@@ -129,8 +131,8 @@ def read_entry(directory: Path) -> RunEntry:
         problems.append(str(error))
     try:
         labels = read_labels(directory)
-        release = bounded_text(str((read_json(directory / VERSIONS) or {}).get("daedalus-rl") or ""), 40)
-    except RunDataError as error:
+        made_by, written_by = releases_of(directory)
+    except (RunDataError, SettingsError) as error:
         problems.append(str(error))
     return RunEntry(
         directory=directory,
@@ -138,7 +140,8 @@ def read_entry(directory: Path) -> RunEntry:
         settings=settings,
         run=run,
         problem="; ".join(problems),
-        release=release,
+        made_by=made_by,
+        written_by=written_by,
         size=sum(sizes_of(directory).values()),
         is_running=is_locked(directory),
     )
@@ -271,8 +274,13 @@ def described(entry: RunEntry) -> list[str]:
     lines = [f"{directory}{what}; {entry.status}"]
     if entry.problem:
         lines.append(entry.problem)
-    made = f"made by daedalus-rl {entry.release}" if entry.release else "the release that made it is not known"
-    lines.append(made)
+    made = f"made by {entry.made_by or 'an unknown release'}"
+    lines.append(made if entry.written_by == entry.made_by else f"{made}, continued by {entry.written_by}")
+    if run is not None and spec is None:
+        try:
+            read_config(directory)
+        except SettingsError as error:
+            lines.append(str(error))
     if entry.labels.tags:
         lines.append(f"tags: {', '.join(entry.labels.tags)}")
     if entry.labels.note:
@@ -286,7 +294,7 @@ def described(entry: RunEntry) -> list[str]:
     lines.append(f"{entry.size / 2**20:,.1f} MiB, most of it in: {', '.join(sizes)}")
     if spec is not None and (modules := module_names(spec)):
         lines.append(f"needs the modules {', '.join(modules)}")
-    if run is not None and best:
+    if run is not None and spec is not None and best:
         lines.append(run.evaluate_command)
         lines.append(run.resume_command)
     return [line if not at else f"  {line}" for at, line in enumerate(lines)]

@@ -14,7 +14,7 @@ import tomllib
 from pathlib import Path
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
-PYTHONS = ("3.11", "3.13")
+PYTHONS = ("3.11", "3.14")
 SYSTEMS = {
     "Windows": ("win_amd64",),
     "macOS, Apple silicon": ("macosx_14_0_arm64",),

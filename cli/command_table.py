@@ -16,6 +16,7 @@ on this machine:
   resume     continue a run from its newest checkpoint
   sweep      train runs of several settings and seeds, and compare them
   check      play an environment with random actions, and report its faults, its speed and what train would choose
+  record     play an environment, and record the episodes as demonstrations
   settings   print the settings of a run with their defaults, limits and meanings
 
 on several machines, one process at a time:
@@ -73,6 +74,7 @@ COMMANDS = {
     "resume": Command("commands.train:resume_parser", "commands.train:resume"),
     "sweep": Command("commands.sweep:parser", "commands.sweep:sweep"),
     "check": Command("commands.check:parser", "commands.check:check"),
+    "record": Command("commands.record:parser", "commands.record:record"),
     "settings": Command("commands.settings_command:parser", "commands.settings_command:settings"),
     "learner": Command("commands.learner:parser"),
     "actor": Command("commands.actor:parser"),

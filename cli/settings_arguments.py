@@ -72,7 +72,7 @@ def add_new_run(options: argparse.ArgumentParser) -> None:
         "--demonstrations",
         metavar="DATASET",
         help="learn from recorded episodes, too: a Minari dataset, as a folder or an id of `minari list local`, with "
-        "the spaces of the environment. Its episodes are copied into the run directory. For sac",
+        "the spaces of the environment. Its episodes are copied into the run directory. For appo and sac",
     )
     options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
     add_log(options)

@@ -40,7 +40,9 @@ class ClientActor:
         self._rows: ClientRows | None = None
         self._rows_epoch = -1  # of the learner that the rows are for
         self._full_version = -1  # of the last full rollout for that learner
-        self._override: Any = None  # the action that is played in the row that has begun, in place of the policy's
+        # The action that is played in the row that has begun, in place of the policy's: as it came, and as gymnasium
+        # has it.
+        self._override = self._played = None
 
     @property
     def name(self) -> str:
@@ -103,8 +105,7 @@ class ClientActor:
         """
         values = self.spaces.observation(message.observation)
         mask = self.spaces.action_mask(message.action_mask)
-        if message.override is not None:
-            self.spaces.check_action(message.override)
+        played = None if message.override is None else self.spaces.checked_action(message.override)
         self._check_reward(message.reward)
         begins = self._begins(current)
         rows = self._new_rows(current) if begins else self.rows
@@ -114,7 +115,7 @@ class ClientActor:
             raise ClientError("misfit", str(error)) from None
         if begins:
             self._begin(rows, current)
-        self._on_action, self._override = on_action, message.override
+        self._on_action, self._override, self._played = on_action, message.override, played
 
     def _begins(self, current: PolicyVersion) -> bool:
         """Whether rows for the learner epoch of a policy begin. The unfinished rollout of others is dropped."""
@@ -165,7 +166,7 @@ class ClientActor:
 
     def begin_row(self) -> RowInputs:
         """Return what the policy chooses from. Call `select_version` before."""
-        return self.rows.begin_row(overridden=self._override is not None, idle=self._awaits_update)
+        return self.rows.begin_row(override=self._played, idle=self._awaits_update)
 
     @property
     def _awaits_update(self) -> bool:

@@ -101,12 +101,15 @@ class ClientSpaces:
         parts = {"action": value} if bare else _components(value, self._masks.keys(), "the action_mask")
         return {name: _mask(parts[name], self._actions[name], name) for name in self._masks}
 
-    def check_action(self, value: Any) -> None:
-        """Raise ClientError unless a value, as `action` returns it, is an action of the space."""
+    def checked_action(self, value: Any) -> Any:
+        """Return an action as gymnasium has it, from one as `action` returns it. Raises ClientError if it is none."""
         bare = self._actions.keys() == {"action"} and not isinstance(value, dict)
         parts = {"action": value} if bare else _components(value, self._actions.keys(), "the override")
         for name, space in self._actions.items():
             _check_action(parts[name], space, "the override" if bare else f"{name} of the override")
+        if self._actions.keys() == {"action"}:
+            return parts["action"]
+        return _nested({name: np.asarray(part) for name, part in parts.items()})
 
     def action(self, value: Any) -> Any:
         """Return gymnasium's action as numbers, lists and maps by component."""

@@ -102,7 +102,8 @@ def main(output: BinaryIO) -> int:
     if arguments.checkpoints is not None:  # the environment may change the working directory
         arguments.checkpoints = Path(os.path.abspath(arguments.checkpoints))
     configure_logging("warning", as_json=False, process="camera")
-    os.nice(NICENESS)
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(NICENESS)
     stop = stop_on_signals(exit_if_stuck=True)
     frames = _Output(output, stop)
     try:

@@ -305,6 +305,8 @@ class _Reader:
 
     def _is_readable(self, milliseconds: int | None = None) -> bool:
         """Wait for output, or for the end of the pipe."""
+        if not hasattr(select, "poll"):  # Windows: the reader waits as it reads, and is up to date at the end
+            return True
         poll = select.poll()  # `select.select` refuses descriptors from 1024 on
         poll.register(self._pipe, select.POLLIN)
         return bool(poll.poll(milliseconds))

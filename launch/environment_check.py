@@ -5,8 +5,8 @@ import json
 import logging
 import math
 import os
-import select
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from daedalus.launch.forked_process import fork as fork_process
 from daedalus.launch.forked_process import open_descriptors
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from daedalus.actor.checking.check_report import EnvironmentReport
 
 _POLL_SECONDS = 0.2
+_KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # which kills on Windows, too
 _ALARM_SECONDS = 5  # after the limit: a process without its parent ends then, even in native code
 
 
@@ -99,93 +100,116 @@ def check_in_process(
     """
     from daedalus.actor.checking.check_report import EnvironmentReport
 
-    reading, writing = os.pipe()
-    with open(reading, "rb", buffering=0) as results:
-        # Apple's frameworks do not work after a fork.
-        forked = fork and sys.platform == "linux" and threading.active_count() == 1
-        try:
-            pid = _forked(check, writing) if forked or check.spec.is_from_python else _spawned(check, writing)
-        finally:
-            os.close(writing)
-        try:
-            answer = _read(results.fileno(), stop or threading.Event(), check.most_seconds, slow_seconds, on_slow)
-            if answer:
-                _end(pid, own_group=not check.shown)  # threads of the environment could keep it alive
-        except BaseException:
-            _end(pid, own_group=not check.shown)
-            raise
-        finally:
-            _, status = os.waitpid(pid, 0)
-    if not answer:
-        ended = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"status {os.WEXITSTATUS(status)}"
+    # Apple's frameworks do not work after a fork.
+    forked = fork and sys.platform == "linux" and hasattr(os, "fork") and threading.active_count() == 1
+    process = _forked(check) if forked or check.spec.is_from_python else _spawned(check)
+    try:
+        answer = _Answer(process.results)
+        answer.wait(stop or threading.Event(), check.most_seconds, slow_seconds, on_slow)
+        if answer.line:
+            process.end(own_group=not check.shown)  # threads of the environment could keep it alive
+    except BaseException:
+        process.end(own_group=not check.shown)
+        raise
+    finally:
+        status = process.wait()
+    if not answer.line:
+        ended = f"signal {-status}" if status < 0 else f"status {status}"
         hint = ", as it would end an actor" if check.shown else ": see what it prints with `daedalus check`"
         return EnvironmentReport(problems=(f"environment {check.spec.id} ended its process ({ended}){hint}",))
-    return EnvironmentReport.model_validate_json(answer)
+    return EnvironmentReport.model_validate_json(answer.line)
 
 
-def _read(
-    descriptor: int, stop: threading.Event, seconds: float, slow_seconds: float, on_slow: Callable[[], object]
-) -> bytes:
-    """Read one line, or nothing if the other end closes before. Raises CheckTimeoutError."""
-    data, began = b"", time.monotonic()
-    while not data.endswith(b"\n"):  # not to the end: processes of the environment may hold the descriptor
-        passed = time.monotonic() - began
-        if stop.is_set() or passed > seconds:
-            raise CheckTimeoutError(f"not done within {seconds:g} s")
-        if passed > slow_seconds:
-            slow_seconds = math.inf
-            on_slow()
-        if not select.select([descriptor], [], [], _POLL_SECONDS)[0]:
-            continue
-        part = os.read(descriptor, 1 << 16)
-        if not part:
-            return b""
-        data += part
-    return data
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Process:
+    """A process that checks an environment."""
+
+    pid: int
+    results: IO[bytes]  # where it writes its report
+    wait: Callable[[], int]  # for its end; returns the exit status, negative after a signal
+
+    def end(self, *, own_group: bool) -> None:
+        """Kill it, with the programs that its environment has started: another simulator could not start."""
+        if own_group:
+            with suppress(OSError, AttributeError):  # a fork has not begun, and has none yet; Windows has no groups
+                os.killpg(self.pid, _KILL)
+        with suppress(PermissionError):  # of Windows, where it has ended
+            os.kill(self.pid, _KILL)
 
 
-def _end(pid: int, *, own_group: bool) -> None:
-    """Kill a check, with the programs that its environment has started: another simulator could not start."""
-    if own_group:
-        with suppress(OSError):  # a fork has not begun, and has none yet
-            os.killpg(pid, signal.SIGKILL)
-    os.kill(pid, signal.SIGKILL)
+class _Answer:
+    """The line that a process writes, read by a thread: not every system can wait for a pipe with a time limit."""
+
+    def __init__(self, results: IO[bytes]) -> None:
+        self.line = b""  # empty if the other end closes before
+        self._changed = threading.Event()
+        threading.Thread(target=self._read, args=(results,), name="check-results", daemon=True).start()
+
+    def wait(self, stop: threading.Event, seconds: float, slow_seconds: float, on_slow: Callable[[], object]) -> None:
+        """Wait for the line or the end. See check_in_process. Raises CheckTimeoutError."""
+        began = time.monotonic()
+        while not self._changed.wait(_POLL_SECONDS):
+            passed = time.monotonic() - began
+            if stop.is_set() or passed > seconds:
+                raise CheckTimeoutError(f"not done within {seconds:g} s")
+            if passed > slow_seconds:
+                slow_seconds = math.inf
+                on_slow()
+
+    def _read(self, results: IO[bytes]) -> None:
+        data = b""
+        with results:  # not to the end: processes of the environment may hold the descriptor
+            while not data.endswith(b"\n") and (part := os.read(results.fileno(), 1 << 16)):
+                data += part
+        self.line = data if data.endswith(b"\n") else b""
+        self._changed.set()
 
 
-def _forked(check: EnvironmentCheck, writing: int) -> int:
-    """Return the process id of a fork that writes the report to a descriptor."""
+def _forked(check: EnvironmentCheck) -> _Process:
+    """Start a fork that writes the report to a pipe."""
+    reading, writing = os.pipe()
 
     def work() -> int:
-        os.setpgid(0, 0)  # see _end
+        os.setpgid(0, 0)  # see _Process.end
         _report(check, writing)
         return 0
 
     silent = os.open(os.devnull, os.O_RDWR)
     try:
-        return fork_process(work, (silent, silent, silent), open_descriptors())
+        pid = fork_process(work, (silent, silent, silent), open_descriptors())
+    except BaseException:
+        os.close(reading)
+        raise
     finally:
         os.close(silent)
+        os.close(writing)
+    results = open(reading, "rb", buffering=0)  # noqa: SIM115 - closed by its reader
+    return _Process(pid=pid, results=results, wait=lambda: os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 
 
-def _spawned(check: EnvironmentCheck, writing: int) -> int:
-    """Return the process id of a new interpreter that writes the report to a descriptor."""
-    os.set_inheritable(writing, True)
-    command = [sys.executable, "-P", "-m", "daedalus.launch.environment_check", str(writing), check.words()]
-    silent = [(os.POSIX_SPAWN_OPEN, standard, os.devnull, os.O_RDWR, 0) for standard in range(3)]
-    shown = [(os.POSIX_SPAWN_DUP2, 2, 1)]  # a debugger of the user reads standard input
-    own_group: dict[str, Any] = {} if check.shown else {"setpgroup": 0}  # see _end
+def _spawned(check: EnvironmentCheck) -> _Process:
+    """Start a new interpreter that writes the report to its standard output."""
     with interrupts_held():
-        file_actions = shown if check.shown else silent
-        return os.posix_spawn(sys.executable, command, os.environ, file_actions=file_actions, **own_group)
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "daedalus.launch.environment_check", check.words()],
+            stdin=None if check.shown else subprocess.DEVNULL,  # a debugger of the user reads it
+            stdout=subprocess.PIPE,
+            stderr=None if check.shown else subprocess.DEVNULL,
+            bufsize=0,
+            process_group=None if check.shown else 0,  # see _Process.end
+        )
+    assert process.stdout is not None
+    return _Process(pid=process.pid, results=process.stdout, wait=process.wait)
 
 
 def _report(check: EnvironmentCheck, writing: int) -> None:
     """Check the environment, and write the report to a descriptor."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # the parent reports Ctrl-C
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.excepthook = threading.__excepthook__  # a fork has the parent's, which ends the process
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(int(check.most_seconds) + _ALARM_SECONDS)
+    if hasattr(signal, "alarm"):  # not on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(int(check.most_seconds) + _ALARM_SECONDS)
     if check.shown:
         faulthandler.enable(all_threads=False)
     report = check.run()
@@ -415,4 +439,6 @@ def quick_check(
 
 
 if __name__ == "__main__":
-    _report(EnvironmentCheck.from_words(sys.argv[2]), int(sys.argv[1]))
+    own_output = os.dup(1)
+    os.dup2(2, 1)  # what the environment prints
+    _report(EnvironmentCheck.from_words(sys.argv[1]), own_output)

@@ -22,7 +22,7 @@ from daedalus.launch.environment_check import expected_defaults, expected_spaces
 from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
-from daedalus.launch.run_choice import NewRun, warn_of_unread, with_record
+from daedalus.launch.run_choice import NewRun, check_learner_installed, warn_of_unread, with_record
 from daedalus.launch.supervision import evaluators
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.reporting.csv_writer import CsvWriter
@@ -159,6 +159,7 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     Modules that the command line itself names are allowed; those that only an existing config.toml names need
     --allow-module. Raises SettingsError or UserModuleError.
     """
+    check_learner_installed()
     if options.reset_statistics and not options.resume:
         raise SettingsError("--reset-statistics needs --resume: a new run has no statistics")
     new = options.new
@@ -259,10 +260,10 @@ class LearnerProcess:
             return NOT_REACHED if finished.missed else REACHED
         if resumed and options.new.demonstrations is not None:
             _logger.info("the demonstrations are those that the run began with, if it has any")
-        if run.changed:
+        restored = _newest_checkpoint(run.directory) if resumed else None
+        if run.changed:  # only now: a run that cannot go on stays as it was
             _logger.info("settings of the run changed: %s", ", ".join(run.changed))
             run_directory.write_config(run.directory, run.spec)
-        restored = _newest_checkpoint(run.directory) if resumed else None
         spaces = options.spaces
         if restored is None and options.prepared is None:
             run, spaces = self._with_spaces(run)

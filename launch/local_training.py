@@ -28,6 +28,7 @@ from daedalus.launch.supervision import (
     Child,
     FailedError,
     Supervised,
+    ask_to_end,
     evaluators,
     start,
     stop,
@@ -104,7 +105,7 @@ def train(
             trackers.start()
             return watch(learner, [*actors, *page], run, stopping)
         finally:
-            learner.process.terminate()
+            ask_to_end(learner.process)
             stop([actor.process for actor in actors])
             stop([learner.process], LEARNER_GRACE_SECONDS)  # where the disk is slow, it takes longer than the others
 
@@ -137,7 +138,7 @@ def supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams, *
 
 def _end(learner: Child, stopping: threading.Event) -> None:
     """End the learner, and wait until it has written its summary, which the evaluation reads."""
-    learner.terminate()
+    ask_to_end(learner)
     deadline = time.monotonic() + _SUMMARY_SECONDS
     while learner.poll() is None and time.monotonic() < deadline and not stopping.wait(_POLL_SECONDS):
         pass

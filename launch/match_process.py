@@ -110,7 +110,8 @@ def main(output: BinaryIO) -> int:
     options.add_argument("--allow-module", action="append", default=[])
     arguments = options.parse_args()
     configure_logging("warning", as_json=False, process="match")
-    os.nice(NICENESS)
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(NICENESS)
     stop = stop_on_signals(exit_if_stuck=True)
     try:
         _play(

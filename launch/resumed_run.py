@@ -8,7 +8,7 @@ from typing import Any
 
 from daedalus.launch.environment_check import checked_spaces
 from daedalus.launch.local_run import LocalRun
-from daedalus.launch.run_choice import warn_of_unread, with_record
+from daedalus.launch.run_choice import check_learner_installed, warn_of_unread, with_record
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.resuming import FinishedRun, finished_run, initial_to_resume, other_spaces, with_changes
 from daedalus.learner.run.run_lock import RunLock
@@ -38,6 +38,7 @@ class ResumeChoice:
 
         `from_python`: the environment is passed again as an object.
         """
+        check_learner_installed()
         spec = run_directory.read_config(self.directory)
         modules = UserModules(self.allowed_modules, str(self.directory / run_directory.CONFIG))
         modules.check(spec.user_modules)

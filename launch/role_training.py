@@ -23,6 +23,7 @@ from daedalus.launch.supervision import (
     Child,
     FailedError,
     Supervised,
+    ask_to_end,
     start,
     stop,
     supervised_actor,
@@ -227,7 +228,7 @@ class RoleTraining:
     def _stop(self, stopping: threading.Event) -> None:
         learners = [each.process for each in self._learners.values()]
         for learner in learners:
-            learner.terminate()
+            ask_to_end(learner)
         stop([each.process for each in self._players])
         stop(learners, LEARNER_GRACE_SECONDS)
         stop([each.process for each in self._routers])

@@ -1,6 +1,7 @@
 """What a user chose to run, and the settings, spaces and directory that a new run gets from it."""
 
 import copy
+import importlib.util
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -178,12 +179,25 @@ class NewRun:
         return lock, spec
 
 
+_LEARNER_PACKAGES = ("torch", "onnx", "tensorboard")
+
+
+def check_learner_installed() -> None:
+    """Raise SettingsError if this installation has no learner."""
+    if absent := [name for name in _LEARNER_PACKAGES if importlib.util.find_spec(name) is None]:
+        raise SettingsError(
+            f"this is the installation of an actor, and a learner needs {' and '.join(absent)}: "
+            'pip install "daedalus-rl[learner]"; for once: uvx --from "daedalus-rl[learner]" daedalus ...'
+        )
+
+
 def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Spaces | None]:
     """Check the environment of a new run, and create its directory.
 
     `fork`: see quick_check. Return the lock of the directory, the specification, and the spaces, or None where the
     check of the environment takes long. Raises SettingsError, EnvironmentProblemError or RunInUseError.
     """
+    check_learner_installed()
     if new.directory is not None:
         run_directory.check_free(new.directory)  # before the environment is made
     check_initial(new.init_from, other_spaces=new.other_spaces)

@@ -1,6 +1,7 @@
 """`daedalus.train`: the command `daedalus train` as a function."""
 
 import logging
+import os
 import sys
 import threading
 import time
@@ -240,7 +241,12 @@ def _trackers(log: str | Sequence[str]) -> list[str]:
 
 
 def _check_types(callback: object, settings: object) -> None:
-    """Raise TypeError for objects that are often given in place of an instance, or of a map."""
+    """Raise TypeError for objects that are often given in place of an instance, or of a map.
+
+    Raise TrainingError for a callback where a child process inherits no pipe.
+    """
+    if callback is not None and not hasattr(os, "killpg"):  # Windows
+        raise TrainingError("this system passes no metrics to a callback: leave it out, and read metrics.csv")
     if not isinstance(callback, Callback | None):
         raise TypeError(f"callback must be an instance of a subclass of daedalus.Callback, not {callback}")
     if not isinstance(settings, Mapping | None) or not all(isinstance(path, str) for path in settings or ()):

@@ -17,7 +17,7 @@ from daedalus.learner.reporting.run_reporter import RunReporter, continue_record
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.resuming import NO_WEIGHTS, Beginning
-from daedalus.learner.run.settings import check_rollout_length, unmeasured_target
+from daedalus.learner.run.settings import DeviceLostError, check_rollout_length, unmeasured_target
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.events import STOPPED_BY, EventFile
 from daedalus.learner.serving.run_context import RunContext
@@ -138,7 +138,12 @@ class LearnerService:
 
         taken = learner.replay.nbytes if isinstance(learner, ReplayLearner) else 0
         directory, spec = self._context.directory, self._context.spec
-        learner.demonstrations = read_demonstrations(directory, spec, learner.spaces, taken, self._heartbeat.beat)
+        demonstrations = read_demonstrations(directory, spec, learner.spaces, taken, self._heartbeat.beat)
+        if demonstrations is None:
+            return
+        learner.learn_from(demonstrations)
+        if self._beginning.restored is None and (result := learner.clone(self._heartbeat.beat)):
+            _logger.info("behaviour cloning: %d updates; %s", spec.training.cloning_updates, result)
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
@@ -188,21 +193,29 @@ class LearnerService:
         outputs = self._outputs
         recorder = Recorder(outputs.writers, outputs.progress, lambda: event_file.add(context.events.take_new()))
         reporter.begin(recorder, time.monotonic())
-        finished, ended, saving = False, None, None
+        finished, ended, saving, saved, lost = False, None, None, False, False
         try:
             ended = loop.run(reporter)
             finished = context.is_finished
+        except DeviceLostError:
+            lost = True
+            raise
         finally:
             ended = ended or time.monotonic()
             try:
                 server.close(_FINISHED if finished else self._why_stopped, finished=finished)
-                saving = checkpointer.begin(last=True)  # it is written while the last metrics are
-                reporter.record(learner, ended, last=True)
+                if not lost:
+                    saving = checkpointer.begin(last=True)  # it is written while the last metrics are
+                    reporter.record(learner, ended, last=True)
                 reporter.close()
             finally:
-                saving = saving or checkpointer.begin(last=True)
-                saved = checkpointer.wait(saving, self._heartbeat.beat)
-                server.orders.take_checkpoint()(saved, saving.result or "the checkpoint is not saved: the disk is slow")
+                result = "the checkpoint is not saved: the GPU has failed"
+                if not lost:
+                    saving = saving or checkpointer.begin(last=True)
+                    saved = checkpointer.wait(saving, self._heartbeat.beat)
+                    result = saving.result or "the checkpoint is not saved: the disk is slow"
+                server.orders.take_checkpoint()(saved, result)
+        assert saving is not None
         confirmation = self._confirmation.result if self._confirmation is not None else None
         if saving.done.is_set():  # else the disk does not answer
             stopped_by = "" if finished else server.orders.stop_cause

@@ -164,13 +164,14 @@ class TrainingLoop:
             self._context.league.advance(learner, env_steps, self._checkpointer.add)
         self._health.left_out = rollouts.left_out
         if not (batch or goes_on):
+            rollouts.count_trained([], learner.finish())  # a GPU is done with the newest batch by now
             return
         began = time.monotonic()
         skipped = learner.updates_skipped
         left_out = self._learn_from(batch, progress)
         learner.anneal_exploration(self._context.spec.training.exploration_annealing(progress, env_steps))
         if learner.policy_version > version:  # a replay buffer that fills makes no update
-            self._server.publisher.publish_if_due(learner.policy_version, learner.weights, max(len(batch), 1))
+            self._server.publisher.publish_if_due(learner.policy_version, learner.begin_weights, max(len(batch), 1))
         rollouts.count_trained(batch, left_out, learner.far_outside)
         now = time.monotonic()
         if learner.far_outside:
@@ -189,7 +190,7 @@ class TrainingLoop:
         self._counters.updates_skipped += skipped
 
     def _learn_from(self, uploads: Sequence[Upload], progress: float) -> list[Upload]:
-        """Train on one batch. Return the rollouts that were left out; gradients were checked before."""
+        """Train on one batch. Return rollouts that were left out of it, or of the last one; gradients were checked."""
         gradients = [upload for upload in uploads if isinstance(upload, Gradient)]
         if gradients:
             self._learner.apply(gradients, progress)

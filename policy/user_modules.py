@@ -173,20 +173,28 @@ class UserState:
                 _undo(before)
 
 
+# numpy 2 keeps its handling of errors in a context variable. To copy all of these takes a tenth of np.geterr's time,
+# which is a twentieth of a step of CartPole.
+_kept_errors = contextvars.copy_context if np.lib.NumpyVersion(np.__version__) >= "2.0.0" else np.geterr
+
+
+def _errors(kept: Any) -> Any:
+    """Return the handling of errors that `_kept_errors` has kept, for np.seterr."""
+    return kept.run(np.geterr) if isinstance(kept, contextvars.Context) else kept
+
+
 def _kept_state() -> tuple[Any, ...]:
-    # numpy keeps its handling of errors in a context variable. To copy all of these takes a tenth of np.geterr's time,
-    # which is a twentieth of a step of CartPole.
-    return contextvars.copy_context(), list(warnings.filters), sys.stdout, sys.stderr
+    return _kept_errors(), list(warnings.filters), sys.stdout, sys.stderr
 
 
 def _are_same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
     """Return whether two results of _kept_state agree, whatever other context variables may be."""
-    return one == other or (one[1:] == other[1:] and one[0].run(np.geterr) == other[0].run(np.geterr))
+    return one == other or (one[1:] == other[1:] and _errors(one[0]) == _errors(other[0]))
 
 
 def _restore(state: tuple[Any, ...]) -> None:
-    context, filters, sys.stdout, sys.stderr = state
-    np.seterr(**context.run(np.geterr))
+    errors, filters, sys.stdout, sys.stderr = state
+    np.seterr(**_errors(errors))
     warnings.resetwarnings()
     warnings.filters[:] = filters  # pyright: ignore[reportIndexIssue]
 

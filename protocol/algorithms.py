@@ -28,6 +28,9 @@ class ActorDemands(Specification):
     """Actors wait for each update; a batch is one rollout of every live actor (a barrier)."""
     next_action: bool = False
     """Targets need the action of the next row (Sarsa), so that a rollout has at least two rows."""
+    learns_overrides: bool = False
+    """Overridden rows are sent with the action that was played, also where a rollout has no other rows. An actor of an
+    older release does not know this field, and sends others."""
 
 
 class AlgorithmRecord(ActorDemands):
@@ -81,7 +84,9 @@ ALGORITHMS = {
         max_lag_batches=8,  # measured: docs/study.md
     ),
     "impala": AlgorithmRecord(summary="asynchronous, corrected for policy lag", corrected=True),
-    "appo": AlgorithmRecord(summary="asynchronous PPO: several passes over each batch", passes_over_batch=True),
+    "appo": AlgorithmRecord(
+        summary="asynchronous PPO: several passes over each batch", passes_over_batch=True, demonstrations=True
+    ),
     "one_step_q": _of_action_values("Q-learning with one-step targets"),
     "one_step_sarsa": _of_action_values("as one_step_q, on the action that was taken next", next_action=True),
     "n_step_q": _of_action_values("Q-learning with n-step targets"),
@@ -91,6 +96,7 @@ ALGORITHMS = {
         heads="policy",
         replay=True,
         demonstrations=True,
+        learns_overrides=True,
     ),
 }
 _OWN = re.compile(r"\w+(\.\w+)*:\w+")  # module:Class

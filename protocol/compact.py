@@ -23,8 +23,8 @@ def bfloat16(weights: dict[str, np.ndarray]) -> Bits:
 def _rounded(name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype != np.float32:
         raise ValueError(f"weight {name!r} has dtype {array.dtype}, only float32 has a bfloat16")
-    bits = np.ascontiguousarray(array).view(np.uint32).reshape(array.shape)
-    rounded = (bits + (0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16)  # wraps for NaN only
+    bits = np.ascontiguousarray(array).reshape(-1).view(np.uint32)  # flat: numpy 1 makes int64 of scalars
+    rounded = (bits + (0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16).reshape(array.shape)  # wraps for NaN only
     return np.where(np.isnan(array), np.uint16(0x7FC0), rounded)
 
 
@@ -34,9 +34,9 @@ def float32(bits: Bits) -> dict[str, np.ndarray]:
 
 
 def _widened(bits: np.ndarray) -> np.ndarray:
-    widened = bits.astype(np.uint32)
+    widened = bits.reshape(-1).astype(np.uint32)
     widened <<= 16  # in place: a learner does this for each gradient that it receives
-    return widened.view(np.float32)
+    return widened.view(np.float32).reshape(bits.shape)
 
 
 def planes(bits: Bits, base: Bits | None) -> dict[str, np.ndarray]:
@@ -76,7 +76,8 @@ def _split(bits: np.ndarray) -> np.ndarray:
 def _joined(name: str, planes: np.ndarray) -> np.ndarray:
     if planes.dtype != np.uint8 or planes.ndim < 1 or len(planes) != 2:
         raise ValueError(f"weight {name!r} must be uint8 [2, ...], not {planes.dtype} {planes.shape}")
-    joined = planes[0].astype(np.uint16)
+    high, low = planes.reshape(2, -1)
+    joined = high.astype(np.uint16)
     joined <<= 8
-    joined |= planes[1]
-    return joined
+    joined |= low
+    return joined.reshape(planes.shape[1:])

@@ -52,6 +52,25 @@ def as_release(text: object) -> str:
     return text if isinstance(text, str) and _RELEASE.fullmatch(text) else ""
 
 
+def remedy(written_by: object) -> str:
+    """Return which other release wrote a file that this one cannot use, and which to install; empty if it is this one.
+
+    `written_by` is a release as the file states it, which may be anything.
+    """
+    theirs, own = as_release(written_by), own_release()
+    if not theirs or theirs == own:
+        return ""
+    version = theirs.partition(" ")[2]
+    if _numbers(version) > _numbers(own.partition(" ")[2]):
+        return f"{theirs} wrote it, which is newer than this one, {own}: pip install '{_DISTRIBUTION}>={version}'"
+    return f"{theirs} wrote it, and this is {own}: use that release for it, pip install '{_DISTRIBUTION}=={version}'"
+
+
+def _numbers(version: str) -> list[int]:
+    found = re.match(r"[0-9]+(?:\.[0-9]+)*", version)
+    return [int(part) for part in found[0].split(".")] if found else []
+
+
 def misfit(theirs: str, their_version: int, own_version: int) -> str:
     """Return which release does not fit which, and which end to upgrade to what.
 

@@ -46,8 +46,8 @@ FROM_PYTHON = "python:"  # beginning of the id of an environment that only the p
 # A requirement that may stand in a command: name, extras and version, without characters of any shell.
 _REQUIREMENT = r"^[A-Za-z0-9][A-Za-z0-9._-]*(\[[A-Za-z0-9._-]+(,[A-Za-z0-9._-]+)*\])?==[0-9][A-Za-z0-9.+_-]*$"
 _MOST_REQUIREMENT = 100  # characters
-# Settings that tell people something: an actor that does not know them plays the same.
-_FOR_PEOPLE = frozenset({"environment.package"})
+# Settings that tell people something, or that ask for more than an actor needs: one that does not know them plays on.
+_NOT_NEEDED = frozenset({"environment.package", "algorithm.learns_overrides"})
 
 
 def is_requirement(text: str) -> bool:
@@ -298,6 +298,9 @@ class LossSpec(Specification):
     normalize_advantages: bool = False
     """Scale the advantages of each batch to mean 0 and standard deviation 1. With `collection.upload=gradients`, each
     actor scales those of each rollout."""
+    min_advantage_deviation: Annotated[float, Field(ge=0.0)] = 0.0
+    """With `normalize_advantages`: smallest standard deviation that advantages are divided by. With 1, and normalised
+    rewards, small ones are not scaled up, such as those of a task that is solved."""
 
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Precision of the forward passes. `auto`: bfloat16 for convolutions where the hardware multiplies it."""
@@ -363,7 +366,7 @@ class TrainingSpec(LossSpec):
     has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
     replay_transitions: PositiveInt = 1_000_000
     """Newest transitions that the replay buffer keeps, at most as many as `env_steps`; `sac` only, as are the next
-    seven settings."""
+    eight settings."""
     replay_megabytes: Annotated[float, Field(gt=0.0)] | None = None
     """MiB of memory that the replay buffer may need: one that needs more is refused. Unset: three quarters of the
     memory that is available when the learner starts."""
@@ -379,9 +382,15 @@ class TrainingSpec(LossSpec):
     n_step: Annotated[int, Field(ge=1, le=64)] = 1
     """Rewards in the target of a transition before it bootstraps; fewer at the end of an episode or a rollout."""
     demonstration_share: UnitInterval = 0.5
-    """Share of each minibatch that comes from demonstrations, where the run has some (`--demonstrations`)."""
+    """Share of each minibatch that comes from demonstrations (`--demonstrations`) and from actions of people that
+    were played in place of the policy's, where there are any."""
     target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
     """Share of the way that the target critics move to the critics at each update."""
+    cloning_updates: NaturalInt = 1000
+    """Updates before training in which the policy imitates the demonstrations (`--demonstrations`); `appo` only, as is
+    the next setting."""
+    cloning_weight: Annotated[float, Field(ge=0.0)] = 0.1
+    """Weight of the imitation of demonstrations in the loss at the start; it falls linearly to 0 over the budget."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
 
@@ -777,7 +786,7 @@ class RunSpec(Specification):
             seed=self.training.seed,
             max_upload_bytes=min(self.service.queue_bytes, 2**63 - 1),
         )
-        of_actors = [path for path in changed_fields(spec) if path not in _FOR_PEOPLE]
+        of_actors = [path for path in changed_fields(spec) if path not in _NOT_NEEDED]
         changed = (*of_actors, *changed_fields(learning, "learning."))
         return spec.model_copy(update={"learning": learning.model_dump(mode="json"), "changed": changed})
 

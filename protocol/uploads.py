@@ -56,7 +56,8 @@ class Rollout:
 
     Where somebody else than the policy chose the action that was played, such as a person or a safety filter, a row is
     `overridden`: it holds the action that the policy would have taken. It is not learned from, and the rows before it
-    are bootstrapped with the value of its observation, but the episode and the memory of the policy go on.
+    are bootstrapped with the value of its observation, but the episode and the memory of the policy go on. Where it
+    is `taught`, too, it holds the action that was played: an algorithm that learns from demonstrations learns from it.
 
     Observations, actions and masks are maps of components, as in Spaces (protocol/spaces.py).
     """
@@ -80,6 +81,8 @@ class Rollout:
     # Of a run with lessons, by parameter [K] float64: the values that these episodes were played with. Empty if K is 0.
     lessons: dict[str, np.ndarray] = field(default_factory=dict)
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
+    # [T, E] bool, the overridden rows that hold the action that was played; None: none
+    taught: np.ndarray | None = field(default=None, metadata={"sparse": True})
     # Env_steps of a game with several agents, at most its rows to learn from times its sides, for the opponents' steps
     # count, too; None: each row is one.
     game_steps: int | None = field(default=None, metadata={"sparse": True})
@@ -135,7 +138,8 @@ class Rollout:
     @property
     def _flags(self) -> dict[str, np.ndarray]:
         flags = {"terminated": self.terminated, "truncated": self.truncated, "valid": self.valid}
-        return flags if self.overridden is None else flags | {"overridden": self.overridden}
+        others = {"overridden": self.overridden, "taught": self.taught}
+        return flags | {name: values for name, values in others.items() if values is not None}
 
     @property
     def rows(self) -> int:

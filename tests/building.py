@@ -94,7 +94,8 @@ def make_rollouts(seed: int, count: int = 2, state_size: int = 0) -> list[Rollou
 
 def join(rollouts: Sequence[Rollout], spaces: Spaces = SPACES) -> Batch:
     """Return a batch of rollouts in new memory."""
-    return BatchAssembler(spaces, torch.device("cpu")).join(rollouts)
+    device = torch.device("cpu")
+    return BatchAssembler(spaces, device).join(rollouts).to(device)
 
 
 def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces = SPACES, seed: int = 1) -> Fleet:

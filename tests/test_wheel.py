@@ -1,13 +1,21 @@
 """Test of wheel and sdist: their files, and use beside packages and scripts of the same names."""
 
+import os
+import re
 import shutil
+import subprocess
+import sys
+import sysconfig
 import tarfile
+import tomllib
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from installing import build, installed, run
 
+import daedalus
 from daedalus.learner.run.settings import preset_names
 
 ROOT = Path(__file__).parent.parent
@@ -62,6 +70,30 @@ def scripts(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def uv(wheel: Path, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run uv without network: of the packages, it installs the wheel alone, and this environment has the rest."""
+    requirements = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    names = [re.split(r"[^\w-]", each)[0] for each in requirements]
+    (tmp_path / "left_out.txt").write_text("".join(f"{name} ; sys_platform == 'none'\n" for name in names))
+    beside = tmp_path / "beside"
+    beside.mkdir()
+    for entry in Path(sysconfig.get_path("purelib")).iterdir():
+        if not entry.name.startswith(("torch", "daedalus", "__editable__", "sitecustomize")):
+            (beside / entry.name).symlink_to(entry)
+    folders = {"UV_TOOL_DIR": "tools", "UV_TOOL_BIN_DIR": "bin", "UV_CACHE_DIR": "cache"}
+    environment = os.environ | {name: str(tmp_path / folder) for name, folder in folders.items()}
+    environment |= {"PYTHONPATH": str(beside), "UV_PYTHON": sys.executable, "UV_OFFLINE": "1", "UV_NO_CONFIG": "1"}
+    options = ("--no-index", "--find-links", str(wheel.parent), "--overrides", str(tmp_path / "left_out.txt"))
+    program = Path(sysconfig.get_path("scripts")) / "uv"
+
+    def run_uv(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [program, *words[:2], *options, *words[2:]]
+        return subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    return run_uv
+
+
 def expected_in_package() -> set[str]:
     """Return the paths of all files of the package, through its links."""
     paths = set()
@@ -100,6 +132,28 @@ def test_train_works_beside_packages_and_scripts_of_the_same_names(environment: 
     output = run(environment / "daedalus", "train", "cartpole", *settings, "--run-dir", "run", folder=scripts)
     assert "evaluation: return" in output
     assert run(environment / "daedalus", "evaluate", "run", "--episodes", "2", folder=scripts)
+
+
+def test_uvx_runs_the_distribution_by_its_name(uv: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    ran = uv("tool", "run", "daedalus-rl", "--version")
+    assert (ran.returncode, ran.stdout) == (0, f"daedalus {daedalus.__version__}\n"), ran.stderr
+
+
+def test_a_tool_without_torch_is_an_actor_and_says_how_to_install_a_learner(
+    uv: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    installed_tool = uv("tool", "install", "daedalus-rl")
+    assert installed_tool.returncode == 0, installed_tool.stderr
+    assert {path.stem for path in (tmp_path / "bin").iterdir()} == {"daedalus", "daedalus-rl"}
+    checked = uv("tool", "run", "daedalus-rl", "check", "--env", "CartPole-v1", "--seconds", "0.1")
+    assert checked.returncode == 0, checked.stdout
+    for command in (("train", "cartpole"), ("learner", "cartpole")):
+        refused = uv("tool", "run", "daedalus-rl", *command)
+        assert refused.returncode == 2, refused.stderr
+        assert re.fullmatch(
+            rf'daedalus {command[0]}: .* a learner needs torch: pip install "daedalus-rl\[learner\]"; .*\n',
+            refused.stderr,
+        )
 
 
 def test_the_public_api_works_beside_packages_and_scripts_of_the_same_names(environment: Path, scripts: Path) -> None:

@@ -3,8 +3,10 @@
 On loopback every user of the machine could connect, publish snapshots, and send rollouts.
 """
 
+import logging
 import os
 import shutil
+import socket
 import stat
 import tempfile
 from collections.abc import Iterator
@@ -17,12 +19,24 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
+_logger = logging.getLogger(__name__)
+
 _PREFIX, _NAME, _LOCK = "daedalus-", "learner", "lock"
 
 
 @contextmanager
 def private_address() -> Iterator[str]:
-    """Return the address of a Unix socket in a new private folder, which is removed at the end."""
+    """Return the address of a Unix socket in a new private folder, which is removed at the end.
+
+    Windows has none: there it is a port of loopback, which other users of the machine reach, and a warning says so.
+    """
+    if fcntl is None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            address = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        _logger.warning("this system has no private sockets: every user of this machine can connect to %s", address)
+        yield address
+        return
     chosen = os.path.abspath(tempfile.gettempdir())
     longest = os.path.join(chosen, f"{_PREFIX}12345678", _NAME)
     with private_folder(chosen if is_socket_path(longest) else "/tmp") as folder:  # where its path is not too long

@@ -68,7 +68,8 @@ class ClientAgent:
           observation: of the observation space.
           action_mask: the legal choices, if the client was constructed with a mask: of the same form.
           override: the action of a person or a safety filter, which is played in place of the policy's: `act` returns
-            it. The policy does not learn from it, but its memory goes on.
+            it. The policy's memory goes on. It is learned from in a run that learns from demonstrations (`sac`), if it
+            is in the action space; in other runs it is not.
 
         Raises ValueError if the observation or the mask does not fit the spaces, ActorError if the learner quarantined
         this actor, and whatever else ended the client's thread.
@@ -84,7 +85,7 @@ class ClientAgent:
             if rows.is_between_rollouts:
                 self._load_newest(rows)
             policy_acts = self._policy_may_act()
-            actions = rows.choose(overridden=override is not None, idle=self._is_idle(rows, policy_acts=policy_acts))
+            actions = rows.choose(override=override, idle=self._is_idle(rows, policy_acts=policy_acts))
             if actions is not None:
                 break
         if override is not None:
@@ -118,6 +119,18 @@ class ClientAgent:
         if self._rows is None:
             raise ValueError("a reward came before any action: call act() first")
         self._rows.reward(value)
+
+    def success(self, reward: float = 1.0, observation: Any = None) -> None:
+        """Reward the last action for reaching the goal, and end the episode as terminated: for a key or a button.
+
+        Args:
+          reward: added to the reward of the last action.
+          observation: see end_episode.
+
+        Raises ValueError as `reward` and `end_episode`.
+        """
+        self.reward(reward)
+        self.end_episode(terminated=True, observation=observation)
 
     def end_episode(self, *, terminated: bool, observation: Any = None) -> None:
         """End the episode; the next `act` begins another one.

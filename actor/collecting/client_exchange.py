@@ -24,7 +24,6 @@ def side_by_side(rollouts: Sequence[Rollout]) -> Rollout:
     first, *others = rollouts
     if not others:
         return first
-    overridden = [np.zeros_like(each.valid) if each.overridden is None else each.overridden for each in rollouts]
     return replace(
         first,
         frames=_joined([each.frames for each in rollouts]),
@@ -39,9 +38,16 @@ def side_by_side(rollouts: Sequence[Rollout]) -> Rollout:
         episode_returns=np.concatenate([each.episode_returns for each in rollouts]),
         episode_lengths=np.concatenate([each.episode_lengths for each in rollouts]),
         lessons=_episodes_joined([each.lessons for each in rollouts]),
-        overridden=np.concatenate(overridden, axis=1) if any(each.any() for each in overridden) else None,
+        overridden=_flags([each.overridden for each in rollouts], first.valid),
+        taught=_flags([each.taught for each in rollouts], first.valid),
         game_steps=None if first.game_steps is None else sum(each.env_steps for each in rollouts),
     )
+
+
+def _flags(parts: Sequence[np.ndarray | None], like: np.ndarray) -> np.ndarray | None:
+    if all(part is None for part in parts):
+        return None
+    return np.concatenate([np.zeros_like(like) if part is None else part for part in parts], axis=1)
 
 
 def _episodes_joined(lessons: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

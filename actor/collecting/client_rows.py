@@ -1,6 +1,7 @@
 """The rows of a loop that somebody else owns, under one learner. State without threads or I/O."""
 
 import copy
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal
@@ -18,6 +19,8 @@ from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.lessons import LessonPlan, Parameters
 from daedalus.protocol.spec import ActorSpec, EnvironmentSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
+
+_logger = logging.getLogger(__name__)
 
 _NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)
 _LARGEST_REWARD = float(np.finfo(np.float32).max)  # rollouts have float32
@@ -41,6 +44,7 @@ class ClientRows:
         on_full: Callable[["ClientRows"], None],
         seat: MatchSeat | None = None,
         agent_ids: bool = False,
+        learns_overrides: bool = False,
         draws: LessonDraws | None = None,
     ) -> None:
         """Construct the rows.
@@ -53,6 +57,7 @@ class ClientRows:
           on_full: called when the rollout is full: it must call `finished_copy`.
           seat: of a match whose seats the loop hosts; None: of none.
           agent_ids: whether the policy observes the number of the seat.
+          learns_overrides: whether the learner learns from the actions that are played in place of the policy's.
           draws: of the parameters of the loop's environment; None: the run has none.
         """
         self.draws = draws
@@ -66,6 +71,8 @@ class ClientRows:
         self._acted = False  # the current row has an action and no outcome yet
         self._idle = False  # the row that has begun is not written
         self._overridden = False  # another action than the policy's is played in it
+        self._learns_overrides, self._warned = learns_overrides, False
+        self._played: dict[str, np.ndarray] | None = None  # that action, if the learner learns from it
         self._ending = False  # the episode ends with the current row, which late rewards may still change
         self._episode_ended = False  # the next row is a reset row
         self._cut: Literal["", "resets", "restarts"] = ""  # after `cut`: what the next observation does to the row
@@ -136,28 +143,41 @@ class ClientRows:
             self._record(observed)
         self._last, self._cut = observed, ""
 
-    def choose(self, *, overridden: bool = False, idle: bool = False) -> dict[str, np.ndarray] | None:
+    def choose(self, *, override: Any = None, idle: bool = False) -> dict[str, np.ndarray] | None:
         """Return the policy's actions {name: [1, D]}; None after a reset row, whose action has no effect.
 
         Args:
-          overridden: another action than the policy's is played: the row is not learned from.
+          override: the action that is played in place of the policy's; None: the policy's is.
           idle: drop the rows of the unfinished rollout and this one; the memory of the policy still goes on.
         """
-        self._begin_row(overridden=overridden, idle=idle)
+        self._begin_row(override=override, idle=idle)
         actions = self._writer.act()
         return actions if self._has_acted() else None
 
-    def begin_row(self, *, overridden: bool = False, idle: bool = False) -> RowInputs:
+    def begin_row(self, *, override: Any = None, idle: bool = False) -> RowInputs:
         """Return what the policy chooses from: see RolloutWriter. The arguments are those of `choose`."""
-        self._begin_row(overridden=overridden, idle=idle)
+        self._begin_row(override=override, idle=idle)
         return self._writer.begin_row()
 
-    def _begin_row(self, *, overridden: bool, idle: bool) -> None:
+    def _begin_row(self, *, override: Any, idle: bool) -> None:
         if idle:
             self._discard()
-        # No rollout begins with an overridden row: in each there is a row to learn from.
-        self._idle = idle or (overridden and self.is_between_rollouts)
-        self._overridden = overridden
+        self._overridden, self._played = override is not None, self._to_learn_from(override)
+        # No rollout begins with a row that nobody learns from: in each there is one to learn from.
+        self._idle = idle or (self._overridden and self._played is None and self.is_between_rollouts)
+
+    def _to_learn_from(self, override: Any) -> dict[str, np.ndarray] | None:
+        """Return the action that is played as the policy would have chosen it; None if it could not, or nobody learns
+        from it."""
+        if override is None or not self._learns_overrides:
+            return None
+        try:
+            return self._transforms.policy_action(override)
+        except ValueError as error:
+            if not self._warned:
+                self._warned = True
+                _logger.warning("an override is played and not learned from, because %s", error)
+            return None
 
     def take_choice(self, choice: Choice) -> bool:
         """Write a choice; return False if it was for a reset row, whose action has no effect: choose once more."""
@@ -175,7 +195,7 @@ class ClientRows:
             self._playing, self._drawn = self._drawn, None
             self._writer.play(0, self.draws.with_lessons(self._playing))
         if self._overridden:
-            self._writer.override()
+            self._writer.override(self._played)
         if self.seat is not None and self.seat.steps is not None:
             self.seat.steps.act(self.seat.number)
             self._is_step = not self._idle and not self._overridden and self.seat.steps.count()
@@ -349,5 +369,6 @@ def make_client_rows(
         on_full=on_full,
         seat=seat,
         agent_ids=spec.environment.agent_ids,
+        learns_overrides=spec.algorithm.learns_overrides,
         draws=LessonDraws(spec, random) if spec.environment.parameters else None,
     )

@@ -188,6 +188,7 @@ class RolloutWriter:
         self._truncated = np.zeros((rows, count), np.bool_)
         self._valid = np.zeros((rows, count), np.bool_)
         self._overridden = np.zeros((rows, count), np.bool_)
+        self._taught = np.zeros((rows, count), np.bool_)
 
     @property
     def is_between_rollouts(self) -> bool:
@@ -238,11 +239,17 @@ class RolloutWriter:
             actions[row] = choice.actions[name]
         for name, masks in self._masks.items():
             masks[row] = self._current_masks[name]
-        self._overridden[row] = False
+        self._overridden[row] = self._taught[row] = False
 
-    def override(self) -> None:
-        """Note that other actions than the policy's are played in the row that has begun."""
+    def override(self, played: dict[str, np.ndarray] | None = None) -> None:
+        """Note that other actions than the policy's are played in the row that has begun.
+
+        `played` are these actions {name: [E, D]}, to learn from; None: nobody learns from the row.
+        """
         self._overridden[self._row] = True
+        self._taught[self._row] = played is not None
+        for name, actions in (played or {}).items():
+            self._actions[name][self._row] = actions
 
     def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
         """Write what VectorEnvironment.step returned for those actions; return whether the rollout is full."""
@@ -321,6 +328,7 @@ class RolloutWriter:
             episode_info=episode_info or {},
             lessons=lesson_arrays(finished.parameters[-self._rewards.size :]),
             overridden=self._overridden if self._overridden.any() else None,
+            taught=self._taught if self._taught.any() else None,
         )
 
 

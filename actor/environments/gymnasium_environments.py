@@ -100,7 +100,7 @@ class EnvironmentsInTurn(SyncVectorEnv):
         """Close all environments, then raise the first exception that one of them raised."""
         self.closed = True  # also after an exception: the environments would be closed again
         errors: list[BaseException] = []
-        for environment in self.envs:
+        for environment in getattr(self, "envs", ()):  # gymnasium 1.1 closes also what could not be made
             try:
                 environment.close()
             except (Exception, SystemExit) as error:  # of the user's code

@@ -23,6 +23,7 @@ from daedalus.protocol.texts import bounded_text
 
 if TYPE_CHECKING:
     import h5py
+    from minari.dataset.minari_storage import MinariStorage
 
 _METADATA_BYTES = 64 << 20  # the bounds of an image's pixels are listed one by one
 _EPISODE_BYTES = 1 << 30  # of one array of an episode
@@ -296,7 +297,7 @@ class MinariWriter:
         *,
         algorithm: str = "",
     ) -> None:
-        """Create the dataset.
+        """Begin a dataset, whose folder is made with the first episode.
 
         Args:
           name: see dataset_folder; an id needs a version, such as `cartpole/mine-v0`.
@@ -304,25 +305,26 @@ class MinariWriter:
           env_spec: gymnasium's specification of it (EnvSpec), which `minari` makes it from again; None: unknown.
           algorithm: who played, for the metadata.
 
-        Raises DatasetError if it exists or cannot be written.
+        Raises DatasetError if it exists.
         """
         _import_minari()
-        from minari.dataset.minari_storage import MinariStorage
-
         self.folder = dataset_folder(name)
         self._name, self.episodes, self.steps = name, 0, 0
-        self._spaces = {"observations": observation_space, "actions": action_space}
+        self._spaces, self._env_spec, self._algorithm = (observation_space, action_space), env_spec, algorithm
+        self._storage: MinariStorage | None = None
         if (self.folder / "data").exists():
             raise DatasetError(f"dataset {name} exists at {self.folder}: choose another name, or remove it")
-        with self._faults():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._storage = MinariStorage.new(
-                self.folder / "data", observation_space, action_space, env_spec, jpeg_encoding=False
-            )
-            known = {_ALGORITHM: algorithm} if algorithm else {}
-            self._storage.update_metadata(
-                {"dataset_id": _dataset_id(name), "minari_version": metadata.version("minari"), **known}
-            )
+
+    def _created(self) -> "MinariStorage":
+        from minari.dataset.minari_storage import MinariStorage
+
+        self.folder.mkdir(parents=True, exist_ok=True)
+        storage = MinariStorage.new(self.folder / "data", *self._spaces, self._env_spec, jpeg_encoding=False)
+        known = {_ALGORITHM: self._algorithm} if self._algorithm else {}
+        storage.update_metadata(
+            {"dataset_id": _dataset_id(self._name), "minari_version": metadata.version("minari"), **known}
+        )
+        return storage
 
     def add(self, episode: Episode, seed: int | None = None) -> None:
         """Write an episode. Raises DatasetError."""
@@ -340,6 +342,7 @@ class MinariWriter:
             truncations=[*ends[1]],
         )
         with self._faults():
+            self._storage = self._storage or self._created()
             self._storage.update_episodes([buffer])
         self.episodes, self.steps = self.episodes + 1, self.steps + steps
 

@@ -6,6 +6,11 @@ A simulated actor has a session, presence and acknowledgements of its own, but n
 rollout of CartPole, 16 rows of 16 environments, repeatedly. First all actors together send --rate rollouts per second,
 a rate that the learner can train on. The cost and the latencies then depend on the number of actors only. Then all
 actors send as fast as they get answers.
+
+    python -m benchmarks.fleet --actors 14 --pixels --device cuda --per-process 1
+
+With --pixels, the frames are like those of Pong, and the learner trains the Nature network with `impala`, one pass over
+batches of --batch rollouts. Only the maximum is measured: env_steps/s from the network to the gradient.
 """
 
 import argparse
@@ -46,8 +51,19 @@ def main() -> int:
     options.add_argument(
         "--seconds", type=float, default=20.0, help="duration of each measurement (default: %(default)g)"
     )
+    options.add_argument("--pixels", action="store_true", help="measure the maximum with frames like those of Pong")
+    options.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the learner, with --pixels")
+    options.add_argument("--batch", type=int, default=16, help="rollouts of a batch, with --pixels")
+    options.add_argument("--per-process", type=int, default=1, help="actors of a process, with --pixels")
     options.add_argument("--plot", type=Path, help="picture of the results to write")
     parsed = options.parse_args()
+    if parsed.pixels:
+        made = [
+            pixels(count, parsed.device, parsed.batch, parsed.seconds, parsed.per_process) for count in parsed.actors
+        ]
+        print(f"{machine()}; {parsed.seconds:g} s each\n")
+        print(table(PIXELS_HEADER, made))
+        return 0
     rows = []
     for count in parsed.actors:
         with scene() as here:
@@ -63,11 +79,13 @@ def main() -> int:
 class Swarm:
     """Simulated actors in several processes."""
 
-    def __init__(self, here: Scene, count: int, rate: float, seconds: float) -> None:
-        each = [len(part) for part in np.array_split(np.arange(count), -(-count // _PER_PROCESS))]
+    def __init__(
+        self, here: Scene, count: int, rate: float, seconds: float, *kind: str, per_process: int = _PER_PROCESS
+    ) -> None:
+        each = [len(part) for part in np.array_split(np.arange(count), -(-count // per_process))]
         self._processes = []
         for first, size in zip(np.cumsum([0, *each[:-1]]), each, strict=True):
-            words = [here.address, first, size, rate / count, seconds]
+            words = [here.address, first, size, rate / count, seconds, *kind]
             self._processes.append(
                 subprocess.Popen(
                     [sys.executable, "-m", "benchmarks.fleet.swarm", *map(str, words)],
@@ -140,6 +158,59 @@ def _measured(here: Scene, count: int, rate: float, seconds: float) -> dict[str,
         row["ack_50"], row["ack_99"] = (1000 * np.quantile(latencies, (0.5, 0.99))).tolist()
         row |= _snapshots(notes, [came for result in results for came in result["came"]], began, seconds)
     return row
+
+
+PIXELS_HEADER = (
+    "actors",
+    "rows of a batch",
+    "env_steps/s",
+    "ack ms, p50 and p99",
+    "policy lag",
+    "CPU: learner",
+    "router",
+)
+
+
+def pixels(count: int, device: str, batch: int, seconds: float, per_process: int) -> tuple[str, ...]:
+    """Measure env_steps/s from simulated actors with pixels to the gradient. Return a row of PIXELS_HEADER."""
+    settings = {
+        "policy.encoder": "nature",
+        "training.algorithm": "impala",
+        "training.batch_rollouts": batch,
+        "training.passes": 1,
+        "training.minibatches": 1,
+        "training.device": device,
+        "collection.envs_per_actor": 16,
+        "collection.rollout_length": 16,
+        "service.queue_megabytes": 256,
+    }
+    words = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+    with scene() as here:
+        router = here.router()
+        words += ["--connect", here.address, "--run-dir", here.folder / "fleet", "--actors", count, *ENDLESS]
+        learner = here.start("learner", "pong", *words)
+        learner.expect("actors join with")
+        swarm = Swarm(here, count, 1e6, seconds, "pixels", per_process=per_process)
+        try:
+            swarm.await_ready()
+            pids = (learner.process.pid, router.process.pid)
+            before = [cpu_seconds(pid) for pid in pids]
+            swarm.go()
+            time.sleep(0.3 * seconds)  # the recording of a GPU's graph is not measured
+            began, first = time.monotonic(), here.status()
+            time.sleep(0.65 * seconds)
+            last, took = here.status(), time.monotonic() - began
+            shares = [f"{(cpu_seconds(pid) - old) / seconds:.0%}" for pid, old in zip(pids, before, strict=True)]
+            results = swarm.results()
+        finally:
+            swarm.close()
+    assert first is not None
+    assert last is not None
+    latencies = [latency for result in results for latency in result["latencies"]]
+    acks = " and ".join(f"{1000 * value:.1f}" for value in np.quantile(latencies, (0.5, 0.99)))
+    rate = (last.env_steps - first.env_steps) / took
+    lag = "?" if last.policy_lag_mean is None else f"{last.policy_lag_mean:.1f}"
+    return str(count), f"{256 * batch:,}", f"{rate:,.0f}", acks, lag, *shares
 
 
 def _snapshots(notes: Path, came: Sequence[Sequence[tuple[int, float]]], began: float, seconds: float) -> dict:

@@ -1,9 +1,10 @@
 """Many simulated actors in one process, each with a session of its own and one recorded rollout.
 
-    python -m benchmarks.fleet.swarm ADDRESS FIRST COUNT RATE SECONDS
+    python -m benchmarks.fleet.swarm ADDRESS FIRST COUNT RATE SECONDS [pixels]
 
-The actors join with the numbers FIRST to FIRST + COUNT - 1, print `ready`, and wait for a line on standard input. Then
-each actor sends at most RATE rollouts per second for SECONDS, with at most one in flight. Prints the results as JSON.
+Rollouts are of CartPole or, with `pixels`, of frames that compress as well as those of Pong. The actors join with the
+numbers FIRST to FIRST + COUNT - 1, print `ready`, and wait for a line on standard input. Then each actor sends at most
+RATE rollouts per second for SECONDS, with at most one in flight. Prints the results as JSON.
 """
 
 import json
@@ -29,25 +30,38 @@ from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.connecting import connect_with_retry
 
-SPACES = Spaces(
+VECTORS = Spaces(
     observations={"observation": ArraySpace(shape=(4,), dtype="float32")},
     actions={"action": DiscreteSpace(counts=(2,))},
+)
+PIXELS = Spaces(
+    observations={"observation": ArraySpace(shape=(84, 84), dtype="uint8", frames=4)},
+    actions={"action": DiscreteSpace(counts=(6,))},
 )
 ENVIRONMENTS = 16
 _LIMITS = Limits()
 _WAIT_SECONDS = 120.0
 
 
-def recorded(rows: int) -> Rollout:
+def recorded(rows: int, spaces: Spaces = VECTORS, seed: int = 1) -> Rollout:
     """Return a rollout of plausible values. Only its size matters."""
-    random = np.random.default_rng(1)
+    random = np.random.default_rng(seed)
     shape = (rows, ENVIRONMENTS)
+    (actions,) = spaces.actions.values()
+    assert isinstance(actions, DiscreteSpace)
+    frames = random.normal(0, 0.05, (rows + 1, ENVIRONMENTS, 4)).astype(np.float32)
+    if spaces is PIXELS:
+        frames = np.full((rows + 4, ENVIRONMENTS, 84, 84), 87, np.uint8)
+        for row, environment in np.ndindex(frames.shape[:2]):  # two paddles and a ball, which move
+            for column, size in ((8, 8), (75, 8), ((3 * row + environment) % 80, 2)):
+                top = (environment * 7 + row * random.integers(0, 3)) % 74
+                frames[row, environment, top : top + size, column : column + 2] = 236
     return Rollout(
         identity=RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0),
         policy_version=0,
-        frames={"observation": random.normal(0, 0.05, (rows + 1, ENVIRONMENTS, 4)).astype(np.float32)},
+        frames={"observation": frames},
         initial_state=np.zeros((ENVIRONMENTS, 0), np.float32),
-        actions={"action": random.integers(0, 2, (*shape, 1)).astype(np.uint8)},
+        actions={"action": random.integers(0, actions.choices, (*shape, 1)).astype(np.uint8)},
         masks={},
         behaviour_log_probs=np.full(shape, -0.7, np.float32),
         rewards=np.ones(shape, np.float32),
@@ -62,7 +76,7 @@ def recorded(rows: int) -> Rollout:
 class Simulated:
     """Actor with a session and without environments."""
 
-    def __init__(self, address: str, name: str) -> None:
+    def __init__(self, address: str, name: str, spaces: Spaces) -> None:
         transport = connect_with_retry([address], threading.Event(), _WAIT_SECONDS)
         assert transport is not None  # the event is never set
         self._transport = transport
@@ -76,13 +90,13 @@ class Simulated:
         self._talk = Conversation(ActorConfig(name=name, incarnation=incarnation, timeout=_WAIT_SECONDS))
         self._session = SessionThread(self._talk, transport, threading.Event())
         found = self._session.run(self._talk.find_learner())
-        join = replace(self._talk.join, spaces=SPACES, environments=ENVIRONMENTS)
+        join = replace(self._talk.join, spaces=spaces, environments=ENVIRONMENTS)
         self._welcome = self._session.run(self._talk.confirm(found, join))
         run = self._welcome.run
         self._inbox = self._transport.subscribe(keys.snapshots(run), self._on_news)
         self._key = keys.rollouts(run, name)
         self._rollout = replace(
-            recorded(self._welcome.spec.collection.rollout_length),
+            recorded(self._welcome.spec.collection.rollout_length, spaces),
             identity=RolloutIdentity(
                 actor=name, incarnation=incarnation, sequence=0, learner_epoch=self._welcome.learner_epoch
             ),
@@ -154,7 +168,8 @@ class Simulated:
 
 def main() -> None:
     address, first, count, rate, seconds = sys.argv[1], *map(float, sys.argv[2:6])
-    actors = [Simulated(address, f"sim-{number}") for number in range(int(first), int(first + count))]
+    spaces = PIXELS if sys.argv[6:] == ["pixels"] else VECTORS
+    actors = [Simulated(address, f"sim-{number}", spaces) for number in range(int(first), int(first + count))]
     try:
         while not actors[0].has_policy():
             time.sleep(0.1)

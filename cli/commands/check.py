@@ -2,9 +2,7 @@
 
 import argparse
 import os
-import sys
 from collections.abc import Iterator
-from contextlib import redirect_stdout
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +18,7 @@ from daedalus.launch.environment_check import (
     with_preset,
 )
 from daedalus.launch.logs import print_error, say
-from daedalus.launch.run_choice import RunChoice
+from daedalus.launch.run_choice import RunChoice, check_learner_installed
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of
@@ -114,10 +112,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
 
 
 def _report(check: EnvironmentCheck) -> EnvironmentReport:
-    """Check an environment, in a process of its own where the system has such processes."""
-    if not hasattr(os, "posix_spawn"):  # Windows
-        with redirect_stdout(sys.stderr):  # the environment may print
-            return check.run()
+    """Check an environment in a process of its own."""
     try:
         return check_in_process(check)
     except CheckTimeoutError as error:
@@ -175,6 +170,10 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     """Return a description of the network, and an empty string; or an empty string, and why it cannot be learned."""
     if spaces is None:
         return "", ""
+    try:
+        check_learner_installed()
+    except SettingsError as error:
+        return f"not tried: {error}", ""
     from daedalus.algorithms.gradients import GradientComputer
     from daedalus.policy.acting.program import export_program
     from daedalus.policy.component_inputs import coded_components

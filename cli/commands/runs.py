@@ -133,7 +133,8 @@ def _list(parsed: argparse.Namespace) -> int:
             "best": entry.directory in best,
             "env_steps": entry.env_steps,
             "bytes": entry.size,
-            "release": entry.release,
+            "made_by": entry.made_by,
+            "written_by": entry.written_by,
             "tags": list(entry.labels.tags),
             "note": entry.labels.note,
             "problem": entry.problem,
@@ -154,7 +155,7 @@ def _list(parsed: argparse.Namespace) -> int:
                 "-" if entry.score is None else f"{entry.score}{mark}",
                 f"{entry.env_steps:,}",
                 _mib(entry.size),
-                entry.release or "-",
+                entry.written_by.removeprefix("daedalus-rl ") or "-",
                 " ".join(entry.labels.tags),
             )
         )

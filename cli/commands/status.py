@@ -443,9 +443,11 @@ def _actors(count: int) -> str:
 
 def _client_texts(actor: ActorStatus) -> list[str]:
     """Return what a client, whose loop its user owns, reports about itself."""
+    # The share of time in which a person, or a safety filter, had to help.
+    share = f" ({actor.overridden_actions / actor.rows:.1%})" if actor.rows >= actor.overridden_actions > 0 else ""
     counts = {
         f"of {actor.deadlines:,} deadlines missed": actor.missed_deadlines,
-        "actions overridden": actor.overridden_actions,
+        f"actions overridden{share}": actor.overridden_actions,
         "safe actions": actor.safe_actions,
         "rollouts dropped": actor.rollouts_dropped,
     }

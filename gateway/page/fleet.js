@@ -19,6 +19,10 @@ const busyShare = (actor) => actor.busy_answers / Math.max(actor.busy_answers + 
 const byCause = (actor) => Object.entries(actor.rollouts_rejected).sort().map(([cause, count]) => `${whole(count)} ${cause}`).join(", ");
 const remarks = (actor) => [byCause(actor), actor.quarantined && `quarantined: ${actor.quarantined}`].filter(Boolean).join("; ");
 
+// The share of time in which a person, or a safety filter, had to help a client.
+const helpedShare = (actor) => actor.overridden_actions / Math.max(actor.rows, actor.overridden_actions, 1);
+const HELPED = { name: "overridden_actions", title: "Helped", number: true, text: (row) => percent(helpedShare(row)), value: helpedShare };
+
 const lagOf = (row) => policyLag(row.policy_lag, row.updates_per_batch)[0];
 
 const COLUMNS = [
@@ -64,7 +68,7 @@ export class Fleet {
       return { ...actor, state: stateOf(actor) };
     });
     const further = columns.filter((name) => !KNOWN.has(name) && this.#actors.some((actor) => isSet(actor[name])));
-    this.#extra = further.map((name) => extraColumn(name, typeof this.#actors[0][name] === "number"));
+    this.#extra = further.map((name) => (name === "overridden_actions" ? HELPED : extraColumn(name, typeof this.#actors[0][name] === "number")));
     this.#draw();
   }
 

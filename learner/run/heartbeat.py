@@ -66,7 +66,7 @@ class Heartbeat:
         with contextlib.suppress(OSError), reserved_descriptors():
             file = open_own(self._path, os.O_WRONLY | os.O_CREAT, 0o644)  # not cut: a full disk has no room for more
             try:
-                os.pwrite(file, f"{now:017.3f} {_boot()}\n".encode(), 0)
+                os.write(file, f"{now:017.3f} {_boot()}\n".encode())
             finally:
                 os.close(file)
 

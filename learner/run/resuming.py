@@ -14,7 +14,14 @@ from daedalus.learner.league.ratings import LeagueState, Ratings
 from daedalus.learner.run.counters import RunCounters, check_counters
 from daedalus.learner.run.run_directory import SUMMARY, VERSIONS, read_json
 from daedalus.learner.run.settings import SettingsError, assign, override, run_spec
-from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
+from daedalus.policy.saving.saved_policy import (
+    NoPolicyError,
+    OtherFormatError,
+    SavedPolicy,
+    check_format,
+    checkpoints,
+    find_policy,
+)
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
@@ -202,6 +209,9 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
     """Return how a run has finished under a specification, or None if there is something left to train.
 
     A learner that was killed between its last checkpoint and its summary has to be started again.
+
+    Raises SettingsError for checkpoints of another format, before anything of the run is changed: the release that
+    wrote them can go on with it.
     """
     counters, league = _newest_counters(directory, spec)
     try:
@@ -236,11 +246,18 @@ def _reached_in_league(spec: RunSpec, state: Any) -> bool:
 
 
 def _newest_counters(directory: Path, spec: RunSpec) -> tuple[RunCounters | None, Any]:
-    """Return the counters of the newest checkpoint and the state of its league, or None for each."""
+    """Return the counters of the newest checkpoint and the state of its league, or None for each.
+
+    Raises SettingsError for a checkpoint of another format.
+    """
     for checkpoint in checkpoints(directory):
         counters = RunCounters(spec.training.target_episodes)
         try:
-            saved = check_counters(SealedDirectory(checkpoint).content["counters"])
+            sealed = SealedDirectory(checkpoint)
+            check_format(checkpoint, sealed)
+            saved = check_counters(sealed.content["counters"])
+        except OtherFormatError as error:
+            raise SettingsError(str(error)) from None
         except (DamagedError, KeyError, ValueError):
             continue  # the learner reports it
         counters.restore(saved)

@@ -35,6 +35,7 @@ from daedalus.learner.run.settings import SettingsError, as_toml, read_settings,
 from daedalus.policy.saving.regular_files import replace_text
 from daedalus.policy.saving.sealed import remove_sealed
 from daedalus.protocol import keys
+from daedalus.protocol.releases import as_release, own_release, remedy
 from daedalus.protocol.spec import RunSpec
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
@@ -45,6 +46,7 @@ REPORT, LABELS = "report.html", "labels.json"
 DEMONSTRATIONS = "demonstrations"  # folder of rollouts (demonstration_files.py)
 LEAGUE = "league"  # folder of kept versions and of other runs' policies that are opponents
 TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run
+_WRITTEN_BY = "# written by "  # first line of config.toml, with the release
 _SUPERSEDED = "superseded_by"  # in summary.json: the epoch of the newer learner
 _PACKAGES = (
     "daedalus-rl",
@@ -204,7 +206,9 @@ def remove_failed(directory: Path) -> None:
 def write_config(directory: Path, spec: RunSpec) -> None:
     """Write config.toml: all settings, including defaults; unset settings are omitted. Raises SettingsError."""
     derived = {"training": {"algorithm_record"}}  # it is read from the class of the algorithm again
-    text = tomli_w.dumps(as_toml(spec.model_dump(mode="json", exclude_none=True, exclude=derived)))
+    text = f"{_WRITTEN_BY}{own_release()}\n" + tomli_w.dumps(
+        as_toml(spec.model_dump(mode="json", exclude_none=True, exclude=derived))
+    )
     try:
         replace_text(directory / CONFIG, text)
     except OSError as error:
@@ -219,7 +223,23 @@ def read_config(directory: Path) -> RunSpec:
     try:
         return run_spec(settings)
     except SettingsError as error:
-        raise SettingsError(f"{directory / CONFIG}: {error}") from None
+        other = remedy(releases_of(directory)[1])
+        raise SettingsError(f"{directory / CONFIG}: {error}{f'; {other}' if other else ''}") from None
+
+
+def releases_of(directory: Path) -> tuple[str, str]:
+    """Return which release of daedalus-rl made a run, and which wrote its settings last; empty texts if not known.
+
+    A run that a newer release has resumed has the settings of that one. Raises SettingsError.
+    """
+    try:
+        stated = (run_files.read_json(directory / VERSIONS) or {}).get(_PACKAGES[0])
+        first = (run_files.read_file(directory / CONFIG, run_files.MAX_TOML_BYTES) or b"").partition(b"\n")[0]
+    except run_files.RunDataError as error:
+        raise SettingsError(str(error)) from None
+    made = as_release(f"{_PACKAGES[0]} {stated}")
+    line = first.decode(errors="replace").rstrip("\r")
+    return made, as_release(line.removeprefix(_WRITTEN_BY)) if line.startswith(_WRITTEN_BY) else made
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

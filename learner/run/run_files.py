@@ -13,7 +13,7 @@ from typing import Any
 from daedalus.policy.saving.regular_files import open_regular, read_regular
 from daedalus.protocol.texts import without_secrets
 
-_MAX_JSON_BYTES, _MAX_TOML_BYTES = 32 << 20, 1 << 20
+_MAX_JSON_BYTES, MAX_TOML_BYTES = 32 << 20, 1 << 20
 _MAX_DEPTH = 64  # of lists and maps within each other; Python's recursion limit is not far above
 _LARGEST_INTEGER = 2**64  # Python refuses to print integers of many digits
 # More names than that with dots between them. tomllib takes hours for a name of 1 MiB.
@@ -75,7 +75,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 def read_toml(path: Path) -> dict[str, Any] | None:
     """Return the content of a TOML file, or None without the file. Raises RunDataError."""
-    content = read_file(path, _MAX_TOML_BYTES)
+    content = read_file(path, MAX_TOML_BYTES)
     if content is None:
         return None
     try:

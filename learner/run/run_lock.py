@@ -88,11 +88,13 @@ class RunLock:
         if not self._is_there():
             raise RunInUseError(f"run directory {self.directory} was removed by another process: try again")
         os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
+        os.lseek(self._descriptor, 0, os.SEEK_SET)
+        os.write(self._descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode())
 
     def _try(self) -> bool:
         """Try to lock the file, and return whether another process does not hold it."""
         if fcntl is None:
+            _logger.warning("this system has no such locks: start no second learner in %s", self.directory)
             return True
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -117,7 +119,8 @@ class RunLock:
 
     def _holder(self) -> tuple[int, str]:
         """Return process id and host of the holder, or 0 if the file does not name them."""
-        text = os.pread(self._descriptor, 300, 0).decode(errors="replace")
+        os.lseek(self._descriptor, 0, os.SEEK_SET)
+        text = os.read(self._descriptor, 300).decode(errors="replace")
         named = re.fullmatch(r"(\d{1,10}) ([\w.-]{1,255})\n", text)
         return (int(named[1]), named[2]) if named else (0, "")
 

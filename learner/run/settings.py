@@ -42,6 +42,10 @@ class SettingsError(Exception):
     """Error for invalid settings. The message names the setting, the reason and the correction."""
 
 
+class DeviceLostError(SettingsError):
+    """The device of the learner does not answer any more: what it holds is lost."""
+
+
 def preset_names() -> list[str]:
     """Return the names of the presets that ship with the package, sorted."""
     folder = importlib.resources.files("daedalus.learner.run.presets")
@@ -299,9 +303,11 @@ def unread_settings(spec: RunSpec) -> set[str]:
         "training.target_period": record.target_network,
         "training.value_loss training.value_coefficient": not record.replay,
         "training.entropy_bonus training.entropy_bonus_final training.normalize_advantages": has_returns,
+        "training.min_advantage_deviation": has_returns and training.normalize_advantages,
         "training.replay_transitions training.replay_megabytes training.replay_saved training.replay_begin "
         "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate "
         "training.demonstration_share": record.replay,
+        "training.cloning_updates training.cloning_weight": record.demonstrations and not record.replay,
         "training.rmsprop_decay": training.optimizer == "rmsprop",
         "policy.separate_value_encoder": has_returns and policy.memory == "none",
         "policy.memory_units": policy.memory != "none",

@@ -284,11 +284,14 @@ class RolloutIntake:
 
         Args:
           rollouts: the rollouts of the batch.
-          left_out: those that were left out of updates, because they have no finite gradient.
-          far_outside: those that were left out because they are far outside what others send; and their components.
+          left_out: those that were left out of updates, because they have no finite gradient; also those of earlier
+            batches, of which it is known only now.
+          far_outside: those of the batch that were left out because they are far outside what others send; and their
+            components.
         """
         with self._lock:
-            for rollout in rollouts:
+            earlier = [each for each in left_out if not any(each is rollout for rollout in rollouts)]
+            for rollout in [*rollouts, *earlier]:
                 fault = None
                 if any(rollout is each for each in left_out):
                     fault = NON_FINITE

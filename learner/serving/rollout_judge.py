@@ -274,7 +274,7 @@ class RolloutJudge:
             or first_component_violation(rollout, spaces, self._spec.policy)
             or number_violation(rollout)
             or self._value_violation(rollout)
-            or _episode_violation(rollout)
+            or _episode_violation(rollout, self._spec.algorithm.learns_overrides)
             or lessons_violation(rollout, self._spec)
         )
 
@@ -306,7 +306,7 @@ class RolloutJudge:
                 return violation
         if environment.reward_clip is not None:
             largest = environment.reward_clip * environment.reward_scale
-            if np.abs(rollout.rewards).max() > largest * (1 + 1e-5):
+            if np.abs(rollout.rewards).max() > np.float32(largest * (1 + 1e-5)):
                 return f"rewards has a value outside the clip range of +-{largest:g}"
         return ""
 
@@ -317,8 +317,11 @@ def _matches(upload: Upload) -> int:
     return sum(each.wins + each.draws + each.losses for each in counts)
 
 
-def _episode_violation(rollout: Rollout) -> str:
-    """Return where the rollout breaks gymnasium's NEXT_STEP rule, or reports other episodes than ended in it."""
+def _episode_violation(rollout: Rollout, teaches: bool = False) -> str:
+    """Return where the rollout breaks gymnasium's NEXT_STEP rule, or reports other episodes than ended in it.
+
+    `teaches`: the run learns from overridden rows.
+    """
     if (rollout.episode_lengths < 1).any():
         return "episode_lengths has a value below 1"
     ends = rollout.terminated | rollout.truncated  # [T, E]
@@ -326,7 +329,10 @@ def _episode_violation(rollout: Rollout) -> str:
         return "an episode ends in a row that only resets"
     if rollout.overridden is not None and (rollout.overridden & ~rollout.valid).any():
         return "a row that only resets is overridden"
-    if rollout.overridden is not None and not rollout.learned.any():
+    if rollout.taught is not None and (rollout.overridden is None or (rollout.taught & ~rollout.overridden).any()):
+        return "a row is taught that is not overridden"
+    taught = teaches and rollout.taught is not None and rollout.taught.any()
+    if rollout.overridden is not None and not rollout.learned.any() and not taught:
         return "every row is overridden: there is none to learn from"
     if (rollout.valid[1:] == ends[:-1]).any():
         return "valid breaks the reset rule: a row must be invalid if, and only if, an episode ended in the row before"

@@ -5,6 +5,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,6 +17,7 @@ from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import Bits, bfloat16, planes
+from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS, Limits
 from daedalus.protocol.messages import (
     CompactSnapshot,
@@ -220,6 +222,11 @@ class SnapshotPublisher:
         self._unpublished_rollouts = 0  # trained on since the last snapshot
         self.version = context.start_version  # the newest published version
         self.extras: Callable[[], dict[str, np.ndarray]] = dict  # what snapshots carry besides the weights
+        spec = context.spec
+        on_gpu = spec.training.device == "cuda" and not (spec.algorithm.synchronous or spec.uploads_gradients)
+        self._background = ThreadPoolExecutor(1, thread_name_prefix="snapshots") if on_gpu else None
+        self._publication: Future[None] = Future()  # the newest in the background
+        self._publication.set_result(None)
 
     def open(self) -> None:
         """Start to answer requests for compact snapshots."""
@@ -228,11 +235,14 @@ class SnapshotPublisher:
     def end(self, run_ended: bytes) -> None:
         """Answer queries for snapshots with `run_ended`, an encoded RunEnded, from now on."""
         self._ended = True
+        wait([self._publication], _CLOSE_SECONDS)
         self._snapshot = run_ended, None
 
     def close(self) -> None:
         """Stop to answer requests for compact snapshots."""
         self._compact.close()
+        if self._background is not None:
+            self._background.shutdown(wait=False, cancel_futures=True)
 
     def program(self, name: str) -> bytes:
         """Return the answer to a query for the program with a hash, or for the current program (`*`)."""
@@ -269,16 +279,22 @@ class SnapshotPublisher:
         self.offered = Program(hash=program_hash(model), model=np.frombuffer(model, np.uint8))
         self._program = encode(self.offered)
 
-    def publish_if_due(self, policy_version: int, weights: Callable[[], dict[str, np.ndarray]], rollouts: int) -> None:
+    def publish_if_due(
+        self, policy_version: int, begin_weights: Callable[[], Callable[[], dict[str, np.ndarray]]], rollouts: int
+    ) -> None:
         """Publish a policy version if enough rollouts were trained on since the last snapshot.
 
         With a small fleet, publish every update. With a large fleet, publish after a quarter of the actors have
         contributed: each snapshot is copied and encoded, and an actor uses at most one for each rollout.
         Publish in any case after a quarter of the policy lag bound, so that rollouts stay well within the bound.
 
+        With a GPU a thread of its own waits for the weights, encodes and publishes them, while updates go on. Versions
+        that are due meanwhile are left out.
+
         Args:
           policy_version: the version of the weights.
-          weights: returns the numpy arrays by parameter name: with a large fleet, few versions are published.
+          begin_weights: begins to copy the weights, and returns what returns the numpy arrays by parameter name: with a
+            large fleet, few versions are published.
           rollouts: number of rollouts in the batch that made the version.
         """
         self._unpublished_rollouts += rollouts
@@ -286,22 +302,35 @@ class SnapshotPublisher:
             live = len(self._context.fleet.live)
         version_due = 4 * (policy_version - self.version) >= self._context.spec.policy_lag_bound_with(live)
         if self._context.spec.algorithm.synchronous or version_due or 4 * self._unpublished_rollouts >= live:
-            self.publish(policy_version, weights())
+            if self._background is None:
+                self.publish(policy_version, begin_weights()())
+            elif self._publication.done():
+                self._publication.result()  # a fault of that thread ends this one
+                self._unpublished_rollouts = 0
+                lessons = self._context.lessons.plan(self._context.counters.env_steps)
+                weights = begin_weights()
+                self._publication = self._background.submit(lambda: self._send(policy_version, weights(), lessons))
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
         """Publish a snapshot. It is encoded once, for subscribers and for queries."""
+        self._publication.result()  # of an earlier version
+        self._unpublished_rollouts = 0
+        lessons = self._context.lessons.plan(self._context.counters.env_steps)
+        self._send(policy_version, {**weights, **self.extras()}, lessons)
+
+    def _send(self, policy_version: int, weights: dict[str, np.ndarray], lessons: LessonPlan | None) -> None:
         snapshot = encode(
             Snapshot(
                 learner_epoch=self._context.learner_epoch,
                 policy_version=policy_version,
                 program=self.offered.hash if self.offered else "",
-                weights={**weights, **self.extras()},
-                lessons=self._context.lessons.plan(self._context.counters.env_steps),
+                weights=weights,
+                lessons=lessons,
             )
         )
         if not self._ended:
             self._snapshot = snapshot, policy_version
-        self.version, self._unpublished_rollouts = policy_version, 0
+        self.version = policy_version
         with contextlib.suppress(TransportError):  # the session is being replaced; actors query a missed snapshot
             self._transport.publish(keys.snapshots(self._context.name), snapshot)
         self._context.fleet.pushed_bytes += len(snapshot)

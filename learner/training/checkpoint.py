@@ -38,6 +38,7 @@ from daedalus.policy.saving.sealed import (
     remove_sealed,
     write_sealed,
 )
+from daedalus.protocol.releases import own_release, remedy
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -84,6 +85,7 @@ def encode_checkpoint(
     }
     content = {
         "format": FORMAT,
+        "release": own_release(),
         "policy_version": policy_version,
         "spec": spec.model_dump(mode="json"),
         "spaces": spaces.model_dump(mode="json"),
@@ -129,9 +131,8 @@ def load_checkpoint(directory: Path) -> Checkpoint:
         state = safetensors.torch.load(sealed.read(_STATE_FILE, _MAX_STATE_BYTES))
         counters = check_counters(sealed.content["counters"])
     except (KeyError, ValueError, safetensors.SafetensorError) as error:
-        raise DamagedError(
-            f"{directory}: damaged, or of another release ({type(error).__name__}): resume the run with that release"
-        ) from None
+        other = remedy(sealed.content.get("release")) or "resume the run with that release"
+        raise DamagedError(f"{directory}: damaged, or of another release ({type(error).__name__}): {other}") from None
     return Checkpoint(policy=policy, state=state, counters=counters)
 
 

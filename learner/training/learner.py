@@ -1,14 +1,14 @@
 """The parameters, the optimiser and the policy version, and their updates. No threads, no I/O."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.curiosity import Curiosity
 from daedalus.algorithms.diagnostics import BATCH_METRICS, FirstPass, batch_metrics, diagnostics
@@ -27,13 +27,16 @@ from daedalus.algorithms.normalization import (
 from daedalus.algorithms.replay_buffer import ReplayBuffer
 from daedalus.learner.run.counters import updates_of
 from daedalus.learner.run.resuming import CheckpointMismatchError
-from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.training.demonstrations import Cloning
 from daedalus.learner.training.optimizers import build_optimizer
+from daedalus.learner.training.update_graphs import UpdateGraphs, check_device, device_faults
 from daedalus.learner.training.update_metrics import UpdateMetrics
+from daedalus.learner.training.update_step import UpdateStep
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.exploration import ANNEALING
 from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.algorithms import is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 from daedalus.protocol.uploads import Gradient, Rollout, Upload
@@ -132,6 +135,24 @@ _Seen = dict[str, Moments]
 _Upload = TypeVar("_Upload", Rollout, Gradient)
 
 
+class _Made(NamedTuple):
+    """What is known of a batch after its updates."""
+
+    first_pass: FirstPass
+    metrics: Tensor  # BATCH_METRICS [3]
+
+
+class _Pending(NamedTuple):
+    """A batch whose updates were launched."""
+
+    batch: Batch  # in main memory
+    kept: list[Rollout]  # what it consists of
+    seen: dict[Rollout, _Seen]
+    progress: float
+    updates: int  # their number
+    made: _Made | None
+
+
 class Learner:
     """Owner of the parameters. Makes policy versions from batches: computes gradients, then applies them."""
 
@@ -153,11 +174,8 @@ class Learner:
         Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces,
         AlgorithmError if the algorithm of the user cannot be used.
         """
-        if spec.device == "cuda" and not torch.cuda.is_available():
-            raise SettingsError(
-                "training.device is cuda, but torch finds no CUDA device: install the NVIDIA driver and a CUDA "
-                "build of torch, or set training.device=cpu"
-            )
+        if spec.device == "cuda":
+            check_device(spec.precision)
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
         self._spec, self.spaces = spec, spaces
@@ -167,7 +185,13 @@ class Learner:
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())
         self._loaded = {name: each for name, each in self._parameters.items() if name != ANNEALING}
-        self._optimizer = build_optimizer(spec, self._flat.values)
+        self.metrics = UpdateMetrics(spaces, self.device, spec.max_gradient_norm)
+        self._step = UpdateStep(spec, self._flat, self.metrics)
+        self._bonus = self._flat.values.new_zeros(())
+        built_in = not (is_own(spec.algorithm) or self._network.has_user_modules)
+        changes = type(self._gradients.algorithm).after_update is not Algorithm.after_update
+        self.graphs = UpdateGraphs(self.device, can_record=built_in and not changes)
+        self._pending: _Pending | None = None  # the newest batch, until it is known that its gradients were finite
         self._assembler = BatchAssembler(spaces, self.device)
         self._observations = ObservationStatistics(self._network.normalizer)
         self._rewards: RewardNormalizer | None = None
@@ -179,10 +203,12 @@ class Learner:
         self._ranges, self._reward_name = ConfirmedRanges(), _REWARDS if self._rewards is None else _RETURNS
         self._reward_shares: dict[Rollout, float] = {}  # of the newest batch: with how much of their size they count
         self.far_outside: dict[Upload, str] = {}  # of the newest batch: what was left out, and its component
-        self.demonstrations: ReplayBuffer | None = None  # that are learned from; see learner/training/demonstrations.py
+        self._cloning: Cloning | None = None  # of demonstrations, if there are any
         self.first_pass: FirstPass | None = None  # of the newest batch, until its memory is used for the next one
         self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
-        self.metrics = UpdateMetrics(spaces, self.device)
+        # Whether `step` returns before a GPU is done: not if what follows a batch changes how the next is sorted out.
+        waits = self._observations.moments or self._curiosity or spec.record.synchronous
+        self.overlaps = self.graphs.is_enabled and not waits
         self.policy_version = 0
         self.updates_skipped = 0  # updates whose gradient was not finite: a new version with unchanged parameters
         self.anneal_exploration(spec.exploration_annealing(0.0, 0))
@@ -208,23 +234,76 @@ class Learner:
         is at fault, or all are, the remaining updates of the batch are skipped: new versions with unchanged parameters.
         An algorithm that makes fewer updates than expected skips none; the version is the same in all cases.
 
+        A GPU may still compute when the method returns: the next call joins its rollouts meanwhile, and returns those
+        of this batch that were left out, as `finish` does.
+
         Args:
           rollouts: the rollouts of the batch, in order.
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
+
+        Raises SettingsError if the GPU has too little memory for the batch, and DeviceLostError if it fails.
         """
-        end = self.policy_version + self.updates_of(rollouts)
+        count = self.updates_of(rollouts)
         if self._curiosity is not None:
             self._curiosity.look(rollouts, _annealed(self._spec.curiosity, 0.0, progress))
         batch, kept, seen = self._sorted_out(rollouts)
+        with device_faults(batch.rewards.numel(), lambda: self._fitting(batch)):
+            on_device = self.graphs.moved(batch)
+            left_out = self.finish()
+            made = self._make_updates(on_device, progress, count)
+            self.policy_version += count
+            self._pending = _Pending(batch, kept, seen, progress, count, made)
+            return left_out if self.overlaps else left_out + self.finish()
+
+    def _fitting(self, batch: Batch) -> int:
+        """Return the number of rows of a batch, by halves of it, whose gradient fits into the memory of the device."""
+        width = batch.rewards.shape[1]
+        while width := width // 2:
+            self.graphs.forget()
+            part = batch.narrowed(width)
+            try:
+                for _ in self._gradients.compute(part.to(self.device), 0.0):
+                    break
+            except torch.OutOfMemoryError:
+                continue
+            return part.rewards.numel()
+        return 0
+
+    def finish(self) -> list[Rollout]:
+        """Wait for the updates of the newest batch, and return the rollouts that were left out of them.
+
+        Raises as `step`.
+        """
+        pending, self._pending = self._pending, None
+        if pending is None:
+            return []
+        with device_faults(pending.batch.rewards.numel(), lambda: self._fitting(pending.batch)):
+            return self._finished(pending)
+
+    def _finished(self, pending: _Pending) -> list[Rollout]:
+        batch, kept, seen, progress, remaining, made = pending
         left_out: list[Rollout] = []
-        while kept and not self._make_updates(batch, progress, end):
+        while True:
+            updates, failed = self._step.end()
+            remaining -= updates
+            if not failed:
+                break
             at_fault = rollouts_at_fault(self._gradients, lambda some: self._joined(some).to(self.device), kept)
             left_out += at_fault
             kept = [rollout for rollout in kept if not any(rollout is each for each in at_fault)] if at_fault else []
-            batch = self._joined(kept) if kept else batch
+            if not kept:
+                break
+            batch = self._joined(kept)
+            made = self._make_updates(self.graphs.moved(batch), progress, remaining)
+        if kept:
+            if made is not None:  # an algorithm of the user may make no update
+                self.first_pass = made.first_pass
+                self.metrics.add_batch_metrics(made.metrics)
+            self.metrics.add_batch(batch)
+        else:
+            self.updates_skipped += remaining
+            self.first_pass = None
         self._merge_observations([seen[rollout] for rollout in kept])
-        self.updates_skipped += end - self.policy_version
-        self.policy_version = end
         return left_out
 
     def _sorted_out(self, rollouts: Sequence[Rollout]) -> tuple[Batch, list[Rollout], dict[Rollout, _Seen]]:
@@ -233,16 +312,19 @@ class Learner:
         If all are, there is no other to tell which are right: then nothing is left out.
         """
         batch, first = self._assembler.join(rollouts), 0
+        stacked = batch.stacked() if self._observations.moments else batch
         seen: dict[Rollout, _Seen] = {}
         for rollout in rollouts:
-            seen[rollout] = self._moments_of(rollout, batch, slice(first, first + rollout.environments))
+            seen[rollout] = self._moments_of(rollout, stacked, slice(first, first + rollout.environments))
             first += rollout.environments
         kept = self._without_far(rollouts, seen)
         if self._rewards is not None:
             self._ranges.merge(
                 self._reward_name, [seen[each][self._reward_name] for each in kept], self._rewards.moments
             )
-        self._reward_shares = {
+        pending = () if self._pending is None else self._pending.kept
+        self._reward_shares = {each: self._reward_shares[each] for each in pending}
+        self._reward_shares |= {
             each: self._ranges.share(self._reward_name, seen[each][self._reward_name]) for each in kept
         }
         if len(kept) < len(rollouts):
@@ -273,31 +355,61 @@ class Learner:
         parts = {name: [each[observations_name(name)] for each in seen] for name in names}
         self._observations.merge(parts, self._ranges)
 
-    def _make_updates(self, batch: Batch, progress: float, end: int) -> bool:
-        """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
+    def _make_updates(self, batch: Batch, progress: float, count: int) -> "_Made | None":
+        """Make the updates that bring the policy to the version after the batch, until a gradient is not finite."""
         self.first_pass = None  # its memory is used for this batch
-        for terms in self._gradients.compute(batch.to(self.device), self.entropy_bonus(progress)):
-            if not self._make_update(terms, progress):
-                return False
-            if self.policy_version == end:
-                break
-        self.policy_version = end  # an algorithm of the user may stop early
-        self.first_pass = self._gradients.take_first_pass()
-        if self.first_pass is not None:  # an algorithm of the user may make no update
-            self.metrics.add_batch_metrics(batch_metrics(self.first_pass))
-        self.metrics.add_batch(batch)
-        return True
+        self._step.begin(self.learning_rate(progress))
+        self._bonus.fill_(self.entropy_bonus(progress))
+        if self._cloning is not None:
+            self._cloning.weight = _annealed(self._spec.cloning_weight, 0.0, progress)
+        return self.graphs.call(self._updated, batch, count)
 
-    def _make_update(self, terms: Terms, progress: float) -> bool:
-        """Make an update with the computed gradient. Return False, without an update, if it is not finite."""
-        norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-        if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
-            return False
-        self.policy_version += 1
-        self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
-        self._gradients.after_update(self.policy_version)
-        self.metrics.add_update(terms, norm, clipped=norm > self._spec.max_gradient_norm)
-        return True
+    def _updated(self, batch: Batch, count: int) -> "_Made | None":
+        """Make updates of a batch on the device, with stacks of frames or without. A graph may record this method."""
+        cloning = self._cloning if self._cloning is not None and self._cloning.weight else None
+        updates = self._gradients.compute(batch.stacked(), self._bonus, self._step if cloning is None else None)
+        for number, terms in enumerate(updates, 1):
+            if cloning is not None:
+                self._flat.gradients.add_(cloning.gradient(), alpha=cloning.weight)
+                self._step.clip(terms)
+                self._step.apply()
+            if not self.graphs.records:
+                if self._step.has_failed:
+                    return None
+                self._gradients.after_update(self.policy_version + number)
+            if number == count:
+                break
+        first_pass = self._gradients.take_first_pass()
+        return None if first_pass is None else _Made(first_pass, batch_metrics(first_pass))
+
+    def learn_from(self, demonstrations: ReplayBuffer) -> None:
+        """Learn from demonstrations, too, from now on."""
+        self.graphs.is_enabled = False  # each update draws other demonstrations, on the CPU
+        self.overlaps = False
+        forward = self._gradients.forward
+        self._cloning = Cloning(self._network, self._flat, forward, self.spaces, demonstrations)
+
+    def clone(self, beat: Callable[[], None] = lambda: None) -> str:
+        """Let the policy imitate the demonstrations before the first update, and return how well it does, in words.
+
+        `beat` is called before each update. Return an empty string where there is nothing to imitate.
+        """
+        cloning, updates = self._cloning, self._spec.cloning_updates
+        if cloning is None or not updates:
+            return ""
+        self._observations.add(cloning.observations())
+        before, optimizer = cloning.held_out(), build_optimizer(self._spec, self._flat.values)
+        rate = self._flat.values.new_tensor(self.learning_rate(0.0))
+        for _ in range(updates):
+            beat()
+            self._flat.gradients.copy_(cloning.gradient())
+            norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
+            optimizer.step(self._flat.values, self._flat.gradients, rate, (~norm.isfinite()).to(rate.dtype))
+        if self._gradients.forward.target_parameters:
+            self._gradients.forward.update_target()
+        return (
+            f"mean log-probability of actions that were held out: {before:.3g} before, {cloning.held_out():.3g} after"
+        )
 
     def apply(self, gradients: Sequence[Gradient], progress: float) -> None:
         """Make one update with the mean of gradients that actors computed, weighted by their env_steps.
@@ -322,14 +434,19 @@ class Learner:
         if self._rewards is not None:
             self._ranges.merge(_RETURNS, [each[_RETURNS] for each in seen], self._rewards.moments)
         self._flat.gradients.copy_(mean_gradient(kept, tuple(self.gradient_shapes)))
-        if self._make_update(mean_terms(kept, self.device), progress):
+        self._step.begin(self.learning_rate(progress))
+        self._step.clip(mean_terms(kept, self.device))
+        self._step.apply()
+        self.policy_version += 1
+        _, failed = self._step.end()
+        if failed:
+            self.updates_skipped += 1
+        else:
+            self._gradients.after_update(self.policy_version)
             self._merge_observations(seen)
             for gradient in kept:
                 if (measured := batch_metrics_of(gradient)) is not None:
                     self.metrics.add_batch_metrics(measured.to(self.device))
-        else:
-            self.policy_version += 1
-            self.updates_skipped += 1
         self._received_diagnostics = diagnostics_of(kept[-1])
         for gradient in kept:
             counts = gradient.action_counts.items()
@@ -347,13 +464,14 @@ class Learner:
         return replace(gradient, gradient=values, metrics=metrics)
 
     def _joined(self, rollouts: Sequence[Rollout]) -> Batch:
-        """Return the batch of the rollouts, with scaled rewards, in main memory."""
-        return self._scaled(self._assembler.join(rollouts), rollouts)
+        """Return the batch of the rollouts, with scaled rewards, in new main memory: the next batch may be joined."""
+        return self._scaled(BatchAssembler(self.spaces, torch.device("cpu")).join(rollouts), rollouts)
 
     def _scaled(self, batch: Batch, rollouts: Sequence[Rollout]) -> Batch:
-        """Scale the rewards of a batch in place: normalised ones, and those that are not confirmed to what counts.
+        """Return the batch to learn from. Scale its rewards in place, and draw its minibatches.
 
-        Add the rewards of curiosity, which have a scale of their own.
+        Rewards are normalised, and those that are not confirmed count less. Those of curiosity are added, which have a
+        scale of their own.
         """
         first = 0
         for rollout in rollouts:
@@ -364,7 +482,7 @@ class Learner:
             self._rewards.scale(batch)
         if self._curiosity is not None:
             self._curiosity.add_to(batch, rollouts)
-        return batch
+        return replace(batch, passes=self._gradients.algorithm.drawn(batch.valid, has_memory=self.state_size > 0))
 
     def learning_rate(self, progress: float) -> float:
         """Return the learning rate at a share of the budget."""
@@ -403,6 +521,16 @@ class Learner:
         """
         return {name: parameter.detach().cpu().numpy() for name, parameter in self._parameters.items()}
 
+    def begin_weights(self) -> Callable[[], dict[str, np.ndarray]]:
+        """Begin to copy all parameters, and return what waits for the copy and returns it, as `weights` does.
+
+        A GPU copies them beside its updates; any thread may wait. On the CPU, wait before the next step.
+        """
+        if self.device.type == "cpu":
+            return self.weights
+        copied = self.graphs.begin_copy({name: each.detach() for name, each in self._parameters.items()})
+        return lambda: {name: each.numpy() for name, each in copied().items()}
+
     def gradient_inputs(self, progress: float) -> dict[str, np.ndarray]:
         """Return what a snapshot needs besides `weights` for actors to compute gradients, at a share of the budget."""
         count = mean = squares = 0.0
@@ -425,7 +553,9 @@ class Learner:
         return {"torch_random_state": torch.get_rng_state(), **self._statistics()}
 
     def _statistics(self) -> dict[str, Tensor]:
-        statistics = {f"{self._spec.optimizer}/{name}": value for name, value in self._optimizer.statistics.items()}
+        statistics = {
+            f"{self._spec.optimizer}/{name}": value for name, value in self._step.optimizer.statistics.items()
+        }
         for component, moments in self._observations.moments.items():
             statistics |= {f"observations/{component}/{name}": value for name, value in moments.state().items()}
         statistics |= self._gradients.statistics

@@ -18,8 +18,14 @@ class Optimizer(Protocol):
 
     statistics: dict[str, Tensor]
 
-    def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
-        """Update `values` [P] in place, by one step along `gradients` [P]."""
+    def step(self, values: Tensor, gradients: Tensor, learning_rate: Tensor, skipped: Tensor) -> None:
+        """Update `values` [P] in place, by one step along `gradients` [P]. No value is read on the CPU.
+
+        Args:
+          values, gradients: on one device, as all arguments.
+          learning_rate: scalar, float32.
+          skipped: scalar, float32; if it is 1, values and statistics stay as they are, and 0 otherwise.
+        """
         ...
 
 
@@ -36,10 +42,10 @@ class Adam:
             "steps": torch.zeros((), device=values.device),  # float32: stops at 2^24, where the bias correction is 1
         }
 
-    def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
+    def step(self, values: Tensor, gradients: Tensor, learning_rate: Tensor, skipped: Tensor) -> None:
         """See Optimizer."""
         statistics = self.statistics
-        statistics["steps"] += 1.0
+        statistics["steps"].add_(1.0).sub_(skipped)
         torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
             [values],
             [gradients],
@@ -54,6 +60,7 @@ class Adam:
             eps=self._epsilon,
             amsgrad=False,
             maximize=False,
+            found_inf=skipped,
         )
 
 
@@ -69,11 +76,13 @@ class RmsProp:
         self._decay = decay
         self.statistics = {"square": torch.zeros_like(values)}
 
-    def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
+    def step(self, values: Tensor, gradients: Tensor, learning_rate: Tensor, skipped: Tensor) -> None:
         """See Optimizer."""
-        square = self.statistics["square"]
-        square.mul_(self._decay).addcmul_(gradients, gradients, value=1.0 - self._decay)
-        values.addcdiv_(gradients, square.add(self._epsilon).sqrt_(), value=-learning_rate)
+        square, skips = self.statistics["square"], skipped > 0.0
+        following = (square * self._decay).addcmul_(gradients, gradients, value=1.0 - self._decay)
+        moved = values.addcdiv(gradients * -learning_rate, following.add(self._epsilon).sqrt_())
+        torch.where(skips, square, following, out=square)
+        torch.where(skips, values, moved, out=values)
 
 
 def build_optimizer(spec: TrainingSpec, values: Tensor) -> Optimizer:

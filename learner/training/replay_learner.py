@@ -45,9 +45,10 @@ class ReplayLearner(Learner):
         self._algorithm = algorithm
         self._learned = {"policy": self._flat.values, **algorithm.learned}
         self._optimizers = {
-            "policy": self._optimizer,
+            "policy": self._step.optimizer,
             **{name: build_optimizer(spec, values) for name, values in algorithm.learned.items()},
         }
+        self.demonstrations: ReplayBuffer | None = None
         self._begin = max(min(spec.replay_begin, self.replay.capacity // 2), 1)
         self._owed = torch.zeros((), dtype=torch.float64)  # updates that rows have earned, and that are not made yet
         # Of the run: its buffer on the disk has the same.
@@ -57,6 +58,10 @@ class ReplayLearner(Learner):
     def replay_identity(self) -> int:
         """Random number of the run, which its saved replay buffer bears."""
         return int(self._identity)
+
+    def learn_from(self, demonstrations: ReplayBuffer) -> None:
+        """See Learner: they are a share of each minibatch."""
+        self.demonstrations = demonstrations
 
     def updates_of(self, rollouts: Sequence[Upload]) -> int:
         """Return the number of updates that the learner makes after it has received these rollouts."""
@@ -105,23 +110,28 @@ class ReplayLearner(Learner):
         if not all(map(math.isfinite, norms.values())):
             self.updates_skipped += 1
             return
+        rate, made = (torch.tensor(value, device=self.device) for value in (self.learning_rate(progress), 0.0))
         for name, gradient in gradients.items():
             if norms[name] > spec.max_gradient_norm:
                 gradient = gradient * (spec.max_gradient_norm / norms[name])
-            self._optimizers[name].step(self._learned[name], gradient, self.learning_rate(progress))
+            self._optimizers[name].step(self._learned[name], gradient, rate, made)
         self._gradients.after_update(self.policy_version)
-        clipped = max(norms.values()) > spec.max_gradient_norm
-        self.metrics.add_update(Terms(*terms), math.hypot(*norms.values()), clipped=clipped)
+        self.metrics.add_update(Terms(*terms), rate.new_tensor(math.hypot(*norms.values())))
+        self.metrics.count_updates(1)
 
     def _sampled(self) -> Transitions:
         """Return a minibatch, with its share of demonstrations: Ball et al. (2023), "Efficient Online Reinforcement
         Learning with Offline Data", section 4.1."""
         spec = self._spec
-        shown = 0 if self.demonstrations is None else round(spec.demonstration_share * spec.minibatch_rows)
-        sources = ((self.replay, spec.minibatch_rows - shown), (self.demonstrations, shown))
-        return joined(
-            [source.sample(count, spec.n_step, spec.discount_factor) for source, count in sources if source and count]
-        )
+        given, taught = len(self.demonstrations or ()), self.replay.taught
+        shown = round(spec.demonstration_share * spec.minibatch_rows) if given or taught else 0
+        if not len(self.replay):  # a person has done all so far
+            shown = spec.minibatch_rows
+        helped = int((torch.rand(shown) < taught / (given + taught)).sum()) if taught else 0
+        counts = {self.replay.sample: spec.minibatch_rows - shown, self.replay.sample_taught: helped}
+        if self.demonstrations is not None:
+            counts[self.demonstrations.sample] = shown - helped
+        return joined([draw(count, spec.n_step, spec.discount_factor) for draw, count in counts.items() if count])
 
     def entropy_bonus(self, progress: float) -> float:
         """Return the weight of the entropy: the temperature, which is learned."""

@@ -20,38 +20,43 @@ METRICS = (*_UPDATE_METRICS, *BATCH_METRICS)
 class UpdateMetrics:
     """Sums over updates, on the learner's device.
 
-    They are read once for each metrics row, because reading them after each update would wait for the device.
+    They are read once for each metrics row, because reading them after each update would wait for the device. What is
+    counted of a batch itself is counted in main memory, where the batch comes from.
     """
 
-    def __init__(self, spaces: Spaces, device: torch.device) -> None:
+    def __init__(self, spaces: Spaces, device: torch.device, max_gradient_norm: float) -> None:
+        """Construct it. `max_gradient_norm`: the norm above which gradients are clipped."""
+        self._max_norm = max_gradient_norm
         arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
         self._image = next((name for name, space in arrays.items() if _shows_image(space)), None)
         self._image_space = arrays.get(self._image or "")
-        self._sums = torch.zeros(len(Terms._fields), device=device)
-        self._norms = 0.0
+        self.update_sums = torch.zeros(len(_UPDATE_METRICS), device=device)
+        self._updates = 0
         self._batch_sums = torch.zeros(len(BATCH_METRICS), device=device)
         self._batches = torch.zeros(len(BATCH_METRICS), device=device)  # that have the metric
-        self._updates = self._clipped_updates = 0
-        self._actions = ActionCounts(spaces, device)
+        self._actions = ActionCounts(spaces, torch.device("cpu"))
         self._newest: Tensor | None = None  # the first image of the newest batch
 
-    def add_update(self, terms: Terms, gradient_norm: float, clipped: bool) -> None:
-        """Add the metrics of an update that changed the parameters, with a clipped gradient or not."""
-        self._sums += torch.stack(terms)
-        self._norms += gradient_norm
-        self._updates += 1
-        self._clipped_updates += clipped
+    def add_update(self, terms: Terms, norm: Tensor) -> None:
+        """Add the metrics of an update: the terms of its loss and the norm of its gradient. Reads no value."""
+        self.update_sums.add_(torch.stack([*terms, norm, torch.gt(norm, self._max_norm, out=torch.empty_like(norm))]))
+
+    def count_updates(self, number: int) -> None:
+        """Count updates whose metrics were added."""
+        self._updates += number
 
     def add_batch_metrics(self, metrics: Tensor) -> None:
         """Add BATCH_METRICS of a batch, or of the rollout of a gradient; nan for a metric that it does not have."""
         known = ~metrics.isnan()
-        self._batch_sums += metrics.where(known, 0.0)
+        self._batch_sums += metrics.nan_to_num(0.0)
         self._batches += known
 
     def add_batch(self, batch: Batch) -> None:
-        """Count the actions of a batch, and keep one of its observations."""
+        """Count the actions of a batch in main memory, and keep one of its observations."""
         if self._image is not None:
-            self._newest = batch.observations[self._image][0, 0]
+            seen = batch.observations[self._image]
+            depth = batch.depths.get(self._image)
+            self._newest = seen[0, 0] if depth is None else seen[:depth, 0]
         self._actions.add(batch)
 
     def add_action_counts(self, counts: dict[str, Tensor]) -> None:
@@ -62,14 +67,11 @@ class UpdateMetrics:
         """Return means over the updates, or batches, since the last call, by name; empty without updates."""
         if not self._updates:
             return {}
-        means = (self._sums / self._updates).tolist()
-        means += [self._norms / self._updates, self._clipped_updates / self._updates]
+        means = [each / self._updates for each in self.update_sums.tolist()]
         batch_means = (self._batch_sums / self._batches).tolist()  # nan without batches that have the metric
-        self._sums.zero_()
-        self._norms = 0.0
-        self._batch_sums.zero_()
-        self._batches.zero_()
-        self._updates = self._clipped_updates = 0
+        for values in (self.update_sums, self._batch_sums, self._batches):
+            values.zero_()
+        self._updates = 0
         known = {name: mean for name, mean in zip(BATCH_METRICS, batch_means, strict=True) if not math.isnan(mean)}
         return dict(zip(_UPDATE_METRICS, means, strict=True)) | known
 

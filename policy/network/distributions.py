@@ -83,16 +83,15 @@ def bounded(values: Tensor, low: float, high: float) -> Tensor:
 class _Bounded(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, low: float, high: float) -> Tensor:
-        ctx.save_for_backward(values)
-        ctx.low, ctx.high = low, high
-        return values.clamp(low, high)
+        clamped = values.clamp(low, high)
+        ctx.save_for_backward(values, clamped)
+        return clamped
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
         (outer,) = gradients
-        (values,) = ctx.saved_tensors
-        # Descent subtracts the gradient.
-        leaves = ((values < ctx.low) & (outer > 0.0)) | ((values > ctx.high) & (outer < 0.0))
+        values, clamped = ctx.saved_tensors
+        leaves = (values - clamped) * outer < 0.0  # descent, which subtracts the gradient, leads further beyond
         return outer.masked_fill(leaves, 0.0), None, None
 
 

@@ -21,7 +21,7 @@ from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.limits import LEARNER_LIMITS
-from daedalus.protocol.releases import unknown_settings
+from daedalus.protocol.releases import remedy, unknown_settings
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -148,15 +148,22 @@ def export_policy(checkpoint: Path, target: Path) -> None:
     write_sealed(target, files, sealed.content)
 
 
+def check_format(directory: Path, sealed: SealedDirectory) -> None:
+    """Raise OtherFormatError unless this release reads the checkpoint in a directory."""
+    found = sealed.content.get("format", 1)
+    if found != FORMAT:
+        other = remedy(sealed.content.get("release")) or "use the release that wrote it"
+        raise OtherFormatError(
+            f"{directory} has format {str(found)[:20]} of checkpoints, and this release reads format {FORMAT} only: "
+            f"{other}, or train again from the run's config.toml"
+        )
+
+
 def read_policy(directory: Path) -> SavedPolicy:
     """Return the policy of a checkpoint. Raises DamagedError if damaged, OtherFormatError for another format."""
     sealed = SealedDirectory(directory)
-    found = sealed.content.get("format", 1)
-    if found != FORMAT:
-        raise OtherFormatError(
-            f"{directory} has format {str(found)[:20]} of checkpoints, and this release reads format {FORMAT} only: "
-            "use the release that wrote it, or train again from the run's config.toml"
-        )
+    check_format(directory, sealed)
+    other = remedy(sealed.content.get("release"))
     try:
         return SavedPolicy(
             directory=directory,
@@ -167,6 +174,7 @@ def read_policy(directory: Path) -> SavedPolicy:
             weights=safetensors.numpy.load(sealed.read(PARAMETERS_FILE, POLICY_LIMITS[PARAMETERS_FILE])),
         )
     except ValidationError as error:
-        raise DamagedError(f"{directory}: written by another release ({unknown_settings(error)})") from None
+        reason = unknown_settings(error)
     except (KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
-        raise DamagedError(f"{directory}: written by another release ({type(error).__name__})") from None
+        reason = type(error).__name__
+    raise DamagedError(f"{directory}: written by another release ({reason}){f'; {other}' if other else ''}")

@@ -22,6 +22,7 @@ from daedalus.learner.serving.rollout_judge import _episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -261,6 +262,37 @@ def test_overridden_action_is_played_and_the_policy_goes_on_as_without_it() -> N
                 np.testing.assert_equal(getattr(rollout, name), getattr(other, name), name)
     found = [None if rollout.overridden is None else rollout.overridden[:, 0].tolist() for rollout in rollouts]
     assert found == [[False, False, True, False, False], [False, False, True, False, False], None]
+
+
+def test_a_run_that_learns_from_people_gets_what_they_played() -> None:
+    played = Played(run_spec())
+    training = {"algorithm": "module:Own", "algorithm_record": AlgorithmRecord(learns_overrides=True)}
+    played.spec = played.spec.model_copy(update={"training": played.spec.training.model_copy(update=training)})
+    client, _ = begun(played)
+    rollouts = []
+    for step, observation in enumerate(observations(2 * ROWS + 1)):
+        # The first rollout is a person's alone; an action that the space does not have is nobody's to learn from.
+        override = step % 4 if step < ROWS else 9 if step == ROWS + 2 else None
+        assert override in (None, int(client.agents[0].act(observation, override=override)))
+        rollouts += [] if not client.has_rollout() else [take(client)]
+    first, second = rollouts
+    assert first.taught is not None
+    assert first.taught.all()
+    assert not first.learned.any()
+    assert first.actions["action"][:, 0, 0].tolist() == [step % 4 for step in range(ROWS)]
+    assert (_episode_violation(first, True), second.taught) == ("", None)
+    assert second.learned[:, 0].tolist() == [True, True, False, True, True]
+
+
+def test_success_rewards_the_last_action_and_ends_the_episode() -> None:
+    client, _ = begun(Played(run_spec()))
+    for observation in observations(ROWS):
+        client.agents[0].act(observation)
+    client.agents[0].success(2.0)
+    client.agents[0].act(observations(1)[0])
+    rollout = take(client)
+    assert rollout.rewards[:, 0].tolist() == [0.0] * (ROWS - 1) + [2.0]
+    assert rollout.terminated[:, 0].tolist() == [False] * (ROWS - 1) + [True]
 
 
 def test_no_rollout_begins_with_an_overridden_row() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.forward import FlatParameters, Forward
-from daedalus.algorithms.minibatches import Minibatch, minibatches
+from daedalus.algorithms.minibatches import Minibatch, draw_pass, minibatches
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.uploads import Rollout
@@ -99,7 +99,7 @@ def test_memory_is_reused_and_completely_overwritten(spaces: Spaces, make: Any) 
     for seed in range(6):
         rollouts = [make(seed=10 * seed), make(seed=10 * seed + 1)]
         batch = assembler.join(rollouts)
-        assert_holds(batch, rollouts, array_space(spaces).frames)
+        assert_holds(batch.to(CPU), rollouts, array_space(spaces).frames)
         copied = [getattr(batch, name) for name in ("starts", *COPIED)]
         places.add(tuple(part.data_ptr() for part in (batch.observations[NAME], batch.actions[ACTION], *copied)))
     assert len(places) == 1
@@ -109,7 +109,14 @@ def test_batches_of_different_sizes_are_assembled_correctly() -> None:
     assembler = BatchAssembler(PIXEL_SPACES, CPU)
     for environments in (3, 5, 1, 3):
         rollouts = [pixels(environments, environments), pixels(7)]
-        assert_holds(assembler.join(rollouts), rollouts, depth=4)
+        assert_holds(assembler.join(rollouts).to(CPU), rollouts, depth=4)
+
+
+def test_threads_join_as_one_thread_does() -> None:
+    rollouts = [pixels(seed, environments=20_000) for seed in range(5)]  # large enough to be copied by threads
+    several, one = (BatchAssembler(PIXEL_SPACES, CPU, threads).join(rollouts).to(CPU) for threads in (3, 1))
+    for theirs, ours in zip(several.tensors(), one.tensors(), strict=True):
+        assert torch.equal(theirs, ours)
 
 
 def test_batch_dtypes() -> None:
@@ -142,7 +149,9 @@ class Numbered:
     factors: Tensor  # [T, B]
 
     def pass_of(self, count: int) -> list[Minibatch]:
-        return list(minibatches(self.batch, self.numbers, 10.0 * self.numbers, self.targets, self.factors, count))
+        drawn = draw_pass(self.batch.valid, count, has_memory=self.batch.initial_state.shape[1] > 0)
+        of_rows = self.numbers, 10.0 * self.numbers, self.targets, self.factors
+        return list(minibatches(self.batch, *of_rows, count, drawn))
 
     def assert_holds(self, minibatch: Minibatch) -> None:
         """Assert that every row of a minibatch equals the row of the batch with the same number."""
@@ -216,7 +225,8 @@ def test_an_action_may_have_the_name_of_a_large_observation() -> None:
     made = numbered(state_size=0)
     image = torch.randn(ROWS + 1, WIDTH, 40, 40)  # too large to be gathered for a whole pass
     batch = replace(made.batch, observations={ACTION: image})
-    for minibatch in minibatches(batch, made.numbers, made.numbers, made.targets, made.factors, 4):
+    drawn = draw_pass(batch.valid, 4, has_memory=False)
+    for minibatch in minibatches(batch, made.numbers, made.numbers, made.targets, made.factors, 4, drawn):
         for column, number in enumerate(minibatch.log_probs[0].int().tolist()):
             t, b = divmod(number, WIDTH)
             assert torch.equal(minibatch.observations[ACTION][0, column], image[t, b])

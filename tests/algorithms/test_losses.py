@@ -21,6 +21,7 @@ from daedalus.algorithms.losses import (
 from daedalus.algorithms.returns import Targets
 from daedalus.policy.network.distributions import Categorical
 from daedalus.protocol.spaces import DiscreteSpace
+from daedalus.protocol.spec import LossSpec
 
 ROWS, COLUMNS = 5, 3
 CELLS = [(t, b) for t in range(ROWS) for b in range(COLUMNS)]
@@ -184,8 +185,14 @@ def test_policy_factors_are_weighted_after_the_advantages_are_normalised(
 ) -> None:
     advantages, weights = normal(random), normal(random).abs()
     targets = Targets(values=normal(random), advantages=advantages, weights=weights)
-    assert torch.equal(policy_factors(targets, valid, normalize=False), weights * advantages)
-    assert torch.equal(policy_factors(targets, valid, normalize=True), weights * normalized(advantages, valid))
+    assert torch.equal(policy_factors(LossSpec(), targets, valid), weights * advantages)
+    spec = LossSpec(normalize_advantages=True)
+    assert torch.equal(policy_factors(spec, targets, valid), weights * normalized(advantages, valid))
+    bounded = spec.model_copy(update={"min_advantage_deviation": 2.5})
+    centred = advantages - advantages[valid == 1.0].mean()
+    assert_close(policy_factors(bounded, targets, valid), weights * centred / 2.5)
+    small = spec.model_copy(update={"min_advantage_deviation": 1e-3})
+    assert torch.equal(policy_factors(small, targets, valid), policy_factors(spec, targets, valid))
 
 
 def test_normalized_of_equal_advantages_is_0() -> None:

@@ -136,7 +136,7 @@ def random_batch(spaces: Spaces, state_size: int, seed: int) -> Batch:
     batch.initial_state.uniform_(-1.0, 1.0, generator=generator)
     batch.starts[1:].copy_(torch.rand(batch.starts[1:].shape, generator=generator) < 0.2)
     batch.valid.copy_(torch.rand(batch.valid.shape, generator=generator) < 0.8)
-    return batch
+    return batch.to(torch.device("cpu"))
 
 
 @pytest.mark.parametrize(

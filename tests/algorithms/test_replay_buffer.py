@@ -36,9 +36,10 @@ def rollout_of(seed: int, rows: int, environments: int, stack: int, *, overridde
     actions = {name: random.uniform(-1.0, 1.0, (*cells, 1)).astype(np.float32) for name in ("arm", "leg")}
     helped = plain.valid & (random.random(cells) < 0.2)
     replaced: dict[str, Any] = {"frames": frames, "actions": actions}
-    return make_rollout(
-        seed=seed, rows=rows, environments=environments, **replaced, overridden=helped if overridden else None
-    )
+    taught = helped & (random.random(cells) < 0.7)
+    if overridden:
+        replaced |= {"overridden": helped, "taught": taught if seed % 2 else None}
+    return make_rollout(seed=seed, rows=rows, environments=environments, **replaced)
 
 
 class Column(NamedTuple):
@@ -54,6 +55,9 @@ class Column(NamedTuple):
         helped = self.rollout.overridden is not None and self.cell("overridden", row)
         return bool(self.cell("valid", row) and not helped)
 
+    def is_taught(self, row: int) -> bool:
+        return self.rollout.taught is not None and bool(self.cell("taught", row))
+
     def stack(self, row: int, depth: int) -> np.ndarray:
         """The newest `depth` frames at an observation; the first one of its episode stands for those before it."""
         begins = [start for start in range(1, row + 1) if not self.cell("valid", start - 1)]
@@ -64,13 +68,13 @@ class Column(NamedTuple):
 
     def target(self, row: int, n_step: int, gamma: float) -> tuple[float, float, int]:
         """Return the sum of the rewards, the discount of the next value, and the row of its observation."""
-        total = 0.0
+        total, same = 0.0, self.is_taught if self.is_taught(row) else self.is_learned
         for i in range(n_step):
             at = row + i
             total += gamma**i * self.cell("rewards", at)
             if self.cell("terminated", at):
                 return total, 0.0, at + 1
-            if self.cell("truncated", at) or at + 1 == self.rollout.rows or not self.is_learned(at + 1):
+            if self.cell("truncated", at) or at + 1 == self.rollout.rows or not same(at + 1):
                 return total, gamma ** (i + 1), at + 1
         return total, gamma**n_step, row + n_step
 
@@ -92,10 +96,13 @@ def test_transitions_are_those_of_the_newest_columns(
         rollout = rollout_of(seed, rows, environments, stack, overridden=seed % 3 > 0)
         buffer.add(rollout)
         held.extend(Column(rollout, environment) for environment in range(environments))
-    expected = [(column, row) for column in held for row in range(rows) if column.is_learned(row)]
-    assert len(buffer) == len(expected)
-    found = buffer.transitions(buffer.learned_rows, n_step, 0.9)
-    for index, (column, row) in enumerate(expected):
+    learned, taught = (
+        [(column, row) for column in held for row in range(rows) if chosen(column, row)]
+        for chosen in (Column.is_learned, Column.is_taught)
+    )
+    assert (len(buffer), buffer.taught) == (len(learned), len(taught))
+    found = buffer.transitions(np.concatenate([buffer.learned_rows, buffer.taught_rows]), n_step, 0.9)
+    for index, (column, row) in enumerate([*learned, *taught]):
         total, discount, following = column.target(row, n_step, 0.9)
         assert float(found.rewards[index]) == pytest.approx(total, abs=1e-5)
         assert float(found.discounts[index]) == pytest.approx(discount)

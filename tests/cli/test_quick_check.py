@@ -1,11 +1,13 @@
 """launch/environment_check.py: the check in a process of its own, and what a run takes from it."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from building import run_spec
@@ -13,11 +15,9 @@ from log_lines import LINES
 from plain import array_space, vector_spaces
 from processes import LIMIT, until
 
-from daedalus.launch import environment_check
 from daedalus.launch import environment_check as module
 from daedalus.launch.environment_check import (
     CheckTimeoutError,
-    EnvironmentCheck,
     EnvironmentProblemError,
     checked_defaults,
     checked_spaces,
@@ -97,14 +97,14 @@ def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.Monke
 
 
 def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[int] = []
+    started: list[subprocess.Popen[Any]] = []
 
-    def spawned(check: EnvironmentCheck, writing: int) -> int:
-        started.append(spawn(check, writing))
-        return started[0]
+    def popen(*arguments: Any, **options: Any) -> subprocess.Popen[Any]:
+        started.append(start(*arguments, **options))
+        return started[-1]
 
-    spawn = environment_check._spawned
-    monkeypatch.setattr(environment_check, "_spawned", spawned)
+    start = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", popen)
     monkeypatch.setattr(module, "_MOST_SECONDS", 10 * LIMIT)
     stop, ended = threading.Event(), threading.Event()
     stop.set()
@@ -116,8 +116,8 @@ def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
     threading.Thread(target=check, daemon=True).start()
     assert ended.wait(LIMIT)
-    with pytest.raises(ChildProcessError):
-        os.waitpid(started[0], os.WNOHANG)  # it has ended
+    (process,) = started
+    assert process.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("fork", [False, True])

@@ -1,6 +1,7 @@
-"""Loops that the caller owns, and actors where a system lacks what only POSIX has."""
+"""Loops that the caller owns, and learners and actors where a system lacks what only POSIX has."""
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -76,12 +77,12 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def portable(tmp_path: Path) -> Iterator[Start]:
-    """Start a script or a function without what only POSIX has."""
+    """Start a Python process that, with its children, lacks what only POSIX has."""
     running: list[Running] = []
 
-    def start(what: str, *arguments: object) -> Running:
-        line = [sys.executable, str(TESTS / "without_posix.py"), what, *map(str, arguments)]
-        running.append(Running(line, tmp_path))
+    def start(*arguments: object) -> Running:
+        lacking = f"PYTHONPATH={TESTS / 'without_posix'}"
+        running.append(Running(["env", lacking, sys.executable, *map(str, arguments)], tmp_path))
         return running[-1]
 
     yield start
@@ -89,17 +90,33 @@ def portable(tmp_path: Path) -> Iterator[Start]:
         one.end()
 
 
-def test_an_actor_and_a_client_run_to_the_end(start: Start, address: str, portable: Start) -> None:
-    learner = start("learner", "cartpole", *SMALL, "--listen", address, "--run-dir", "run")
-    actor = portable("daedalus.cli.commands.actor:main", "--connect", address, "--name", "plain", "--envs", 2)
-    loop = portable(str(OWN_LOOP), address, "--name", "robot")
+def test_a_learner_an_actor_and_a_client_run_to_the_end(address: str, portable: Start) -> None:
+    learner = portable("-m", "daedalus", "learner", "cartpole", *SMALL, "--listen", address, "--run-dir", "run")
+    learner.expect("this system has no such locks: start no second learner in")
+    actor = portable("-m", "daedalus", "actor", "--connect", address, "--name", "plain", "--envs", 2)
+    loop = portable(OWN_LOOP, address, "--name", "robot")
     assert learner.wait() == 3, learner.output  # the budget ended without the target
     for ended in (actor, loop):
         assert ended.wait() == 0, ended.output
         ended.expect("the run is over")
 
 
-def test_the_command_starts_the_actor_as_a_child(portable: Start) -> None:
-    command = portable("daedalus.cli.main:main", "actor")
-    assert command.wait() == 2, command.output
-    command.expect("the following arguments are required: --connect")
+def test_a_training_that_is_stopped_saves_a_checkpoint(portable: Start) -> None:
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    training = portable("-m", "daedalus", "train", "cartpole", *endless, "--run-dir", "run")
+    training.expect("every user of this machine can connect to tcp/127.0.0.1:")
+    training.expect(r" env_steps +[1-9]")
+    training.process.send_signal(signal.SIGINT)  # to this process alone
+    assert training.wait() == 1, training.output
+    training.expect(r"stopped; checkpoint saved at [1-9][\d,]* env_steps: run/checkpoints/")
+
+
+def test_every_module_of_the_learner_is_imported(portable: Start) -> None:
+    program = (
+        "import importlib, pkgutil, daedalus.algorithms, daedalus.learner, daedalus.launch, daedalus.policy\n"
+        "for package in (daedalus.algorithms, daedalus.learner, daedalus.launch, daedalus.policy):\n"
+        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        importlib.import_module(module.name)\n"
+    )
+    imported = portable("-c", program)
+    assert imported.wait() == 0, imported.output

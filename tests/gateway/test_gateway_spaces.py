@@ -234,7 +234,7 @@ def test_long_text_among_numbers_takes_no_memory(is_override: bool) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(ClientError, match="numbers"):
-            (spaces.check_action if is_override else spaces.observation)(value)
+            (spaces.checked_action if is_override else spaces.observation)(value)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -280,7 +280,7 @@ def test_largest_legal_message_fits_the_limit() -> None:
 
 @pytest.mark.parametrize("value", [1, [1]])
 def test_override_is_an_action_of_the_space(value: Any) -> None:
-    ClientSpaces({"observation": PLAIN}, {"action": CHOICE}).check_action(value)
+    ClientSpaces({"observation": PLAIN}, {"action": CHOICE}).checked_action(value)
 
 
 @pytest.mark.parametrize(
@@ -305,7 +305,7 @@ def test_override_is_an_action_of_the_space(value: Any) -> None:
 )
 def test_wrong_override_is_named(action: Any, value: Any, text: str) -> None:
     with pytest.raises(ClientError, match=text):
-        ClientSpaces({"observation": PLAIN}, {"action": action}).check_action(value)
+        ClientSpaces({"observation": PLAIN}, {"action": action}).checked_action(value)
 
 
 @pytest.mark.parametrize("shape", [[16, 1_300_000, 3], [4, 16_000_000], [9000, 16]])

@@ -405,6 +405,10 @@ def with_fleet(network: MemoryNetwork, server: ActorServer, count: int) -> Memor
     return actors
 
 
+def no_weights() -> dict[str, np.ndarray]:
+    return {"w": np.zeros(2, np.float32)}
+
+
 @pytest.mark.parametrize(
     ("count", "published"),
     [(1, [1, 2, 3, 4, 5, 6]), (4, [1, 2, 3, 4, 5, 6]), (8, [2, 4, 6]), (12, [3, 6]), (40, [])],
@@ -416,7 +420,7 @@ def test_publication_interval_grows_with_the_fleet(
     news: list[int] = []
     inbox = actors.subscribe(keys.snapshots("r"), lambda: news.append(version_of(inbox.take())))
     for version in range(1, 7):
-        server.publisher.publish_if_due(version, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
+        server.publisher.publish_if_due(version, lambda: no_weights, rollouts=1)
     assert news == published
     assert server.publisher.version == (published or [0])[-1]
 
@@ -427,7 +431,7 @@ def test_publication_interval_is_at_most_a_quarter_of_the_policy_lag_bound(netwo
         with_fleet(network, server, 400)
         published = set()
         for version in range(1, 41):
-            server.publisher.publish_if_due(version, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
+            server.publisher.publish_if_due(version, lambda: no_weights, rollouts=1)
             published.add(server.publisher.version)
         assert published == {0, 8, 16, 24, 32, 40}
     finally:
@@ -472,8 +476,36 @@ def test_synchronous_algorithm_publishes_every_version(network: MemoryNetwork) -
     try:
         with_fleet(network, server, 40)
         for version in (1, 2):
-            server.publisher.publish_if_due(version, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
+            server.publisher.publish_if_due(version, lambda: no_weights, rollouts=1)
             assert server.publisher.version == version
+    finally:
+        server.close("the test is over")
+
+
+def test_with_a_gpu_versions_that_are_due_while_one_is_copied_are_left_out(network: MemoryNetwork) -> None:
+    server = open_server(network, run_spec(device="cuda", algorithm="impala"), RunCounters(10))
+    copied, published = threading.Event(), threading.Event()
+
+    def slow() -> dict[str, np.ndarray]:
+        assert copied.wait(LIMIT)
+        return no_weights()
+
+    try:
+        actors = with_fleet(network, server, 1)
+        news: list[int] = []
+
+        def receive() -> None:
+            news.append(version_of(inbox.take()))
+            published.set()
+
+        inbox = actors.subscribe(keys.snapshots("r"), receive)
+        for version in (1, 2, 3):
+            server.publisher.publish_if_due(version, lambda: slow, rollouts=1)
+        assert server.publisher.version == 0
+        copied.set()
+        assert published.wait(LIMIT)
+        server.publisher.publish(4, no_weights())  # waits for the thread
+        assert news == [1, 4]
     finally:
         server.close("the test is over")
 
@@ -482,7 +514,7 @@ def test_acknowledgement_contains_the_newest_published_version(network: MemoryNe
     """An actor cannot fetch a version that is not published."""
     offer_policy(server)
     actors = with_fleet(network, server, 40)
-    server.publisher.publish_if_due(4, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
+    server.publisher.publish_if_due(4, lambda: no_weights, rollouts=1)
     rollout = make_rollout(identity("a0", 0), version=0)
     (answer,) = actors.query(keys.rollouts("r", "a0"), encode(rollout), timeout=LIMIT)
     acknowledgement = decode(answer, Limits())

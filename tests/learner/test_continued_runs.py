@@ -19,7 +19,7 @@ from daedalus.learner.run.resuming import (
 )
 from daedalus.learner.run.run_directory import create_locked, write_json
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.saving.saved_policy import SavedPolicy
+from daedalus.policy.saving.saved_policy import FORMAT, SavedPolicy
 from daedalus.policy.saving.sealed import write_sealed
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
@@ -119,7 +119,7 @@ def run(tmp_path: Path) -> Path:
     counters = RunCounters(3)
     counters.env_steps = 5000
     counters.returns.extend([11.0, 12.0, 13.0])
-    write_sealed(tmp_path / "checkpoints" / "0000000007", {}, {"counters": counters.state(60.0)})
+    write_sealed(tmp_path / "checkpoints" / "0000000007", {}, {"format": FORMAT, "counters": counters.state(60.0)})
     return tmp_path
 
 
@@ -160,7 +160,7 @@ def test_a_run_that_an_evaluation_solved_has_nothing_to_train(run: Path) -> None
     counters = RunCounters(3)
     counters.env_steps = 5000
     counters.evaluated(99.0)
-    write_sealed(run / "checkpoints" / "0000000008", {}, {"counters": counters.state(60.0)})
+    write_sealed(run / "checkpoints" / "0000000008", {}, {"format": FORMAT, "counters": counters.state(60.0)})
     target = {**TARGET, "target_return": 99.0}
     for budget in (5000, 9000):
         end = finished(run, {}, **target, algorithm="one_step_q", env_steps=budget)
@@ -177,7 +177,7 @@ def test_a_learner_that_was_killed_before_its_summary_is_started_again(run: Path
 
 
 def test_a_damaged_checkpoint_is_skipped(run: Path) -> None:
-    write_sealed(run / "checkpoints" / "0000000008", {}, {"counters": {"env_steps": "many"}})
+    write_sealed(run / "checkpoints" / "0000000008", {}, {"format": FORMAT, "counters": {"env_steps": "many"}})
     (run / "checkpoints" / "0000000009").mkdir()
     assert finished(run, {}, env_steps=5000) is not None
 

@@ -161,8 +161,9 @@ def test_rollouts_at_fault_are_counted_for_their_senders_and_the_run() -> None:
     context = run_context(fleet=joined_fleet("a", "b"))
     fleet, counters, intake = context.fleet, context.counters, RolloutIntake(context, lambda: 0)
     batch = [rollout("a"), rollout("b"), make_rollout(identity("b", incarnation=9)), rollout("z")]
-    for _ in range(3):
+    for _ in range(2):
         intake.count_trained(batch, [batch[1], batch[3]])
+    intake.count_trained([], [batch[1], batch[3]])  # of an earlier batch
     assert counters.rollouts_rejected == {"non_finite": 6}
     assert fleet.live == {"a"}
     assert not fleet.actors["a"].rejected

@@ -286,14 +286,16 @@ def test_metrics_are_means_since_the_last_call() -> None:
 
 
 def test_batches_without_a_metric_do_not_count_in_its_mean() -> None:
-    metrics = UpdateMetrics(SPACES, torch.device("cpu"))
+    metrics = UpdateMetrics(SPACES, torch.device("cpu"), 1.0)
     terms = Terms(*[torch.zeros(()) for _ in Terms._fields])
-    metrics.add_update(terms, 1.0, clipped=False)
+    metrics.add_update(terms, torch.ones(()))
+    metrics.count_updates(1)
     for explained in (0.5, np.nan, 0.25):
         metrics.add_batch_metrics(torch.tensor([explained, 3.0, 4.0]))
     means = metrics.take_means()
     assert (means["explained_variance"], means["value_mean"]) == (0.375, 3.0)
-    metrics.add_update(terms, 1.0, clipped=False)
+    metrics.add_update(terms, torch.ones(()))
+    metrics.count_updates(1)
     metrics.add_batch_metrics(torch.tensor([np.nan, 3.0, 4.0]))
     assert "explained_variance" not in metrics.take_means()
 
@@ -580,12 +582,14 @@ def test_share_of_clipped_gradients_is_over_the_updates_since_the_last_row(bound
 
 
 def test_share_of_clipped_gradients_counts_updates() -> None:
-    metrics = UpdateMetrics(SPACES, torch.device("cpu"))
+    metrics = UpdateMetrics(SPACES, torch.device("cpu"), 1.0)
     terms = Terms(*[torch.zeros(()) for _ in Terms._fields])
-    for clipped in (True, False, False, True, False):
-        metrics.add_update(terms, 1.0, clipped)
+    for norm in (2.0, 1.0, 0.5, 9.0, 0.0):
+        metrics.add_update(terms, torch.tensor(norm))
+    metrics.count_updates(5)
     assert metrics.take_means()["gradient_clipped_fraction"] == 0.4
-    metrics.add_update(terms, 1.0, clipped=True)
+    metrics.add_update(terms, torch.tensor(1.5))
+    metrics.count_updates(1)
     assert metrics.take_means()["gradient_clipped_fraction"] == 1.0
 
 

@@ -11,6 +11,8 @@ from torch.testing import assert_close
 from daedalus.algorithms.forward import FlatParameters
 from daedalus.learner.training.optimizers import Adam, RmsProp
 
+MADE, SKIPPED = torch.zeros(()), torch.ones(())
+
 
 def network() -> nn.Sequential:
     torch.manual_seed(3)
@@ -34,7 +36,7 @@ def test_adam_equals_torch_adam(epsilon: float) -> None:
     adam, reference = Adam(torch.zeros(size), epsilon), torch.optim.Adam([theirs], eps=epsilon)
     for step, gradient in enumerate(gradients(200, size)):
         rate = 1e-2 * (1.0 - step / 200)
-        adam.step(ours, gradient, rate)
+        adam.step(ours, gradient, torch.tensor(rate), MADE)
         reference.param_groups[0]["lr"] = rate
         theirs.grad = gradient.clone()
         reference.step()
@@ -47,11 +49,21 @@ def test_rmsprop_adds_epsilon_inside_the_root() -> None:
     theta, g = ours.tolist(), [0.0] * size
     rmsprop = RmsProp(torch.zeros(size), epsilon, decay)
     for gradient in gradients(50, size):
-        rmsprop.step(ours, gradient, rate)
+        rmsprop.step(ours, gradient, torch.tensor(rate), MADE)
         for i, d in enumerate(gradient.tolist()):
             g[i] = decay * g[i] + (1.0 - decay) * d * d
             theta[i] -= rate * d / math.sqrt(g[i] + epsilon)
         assert ours.tolist() == pytest.approx(theta, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("optimizer", [Adam(torch.ones(6), 1e-5), RmsProp(torch.ones(6), 1e-5, 0.9)])
+def test_a_skipped_step_changes_nothing(optimizer: Adam | RmsProp) -> None:
+    values = torch.ones(6)
+    optimizer.step(values, torch.ones(6), torch.tensor(0.1), MADE)
+    before = [each.clone() for each in (values, *optimizer.statistics.values())]
+    optimizer.step(values, torch.full((6,), math.nan), torch.tensor(0.1), SKIPPED)
+    for after, expected in zip((values, *optimizer.statistics.values()), before, strict=True):
+        assert torch.equal(after, expected)
 
 
 def test_flat_parameters_keep_the_initial_values() -> None:

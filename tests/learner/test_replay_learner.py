@@ -98,6 +98,21 @@ def test_half_of_each_minibatch_is_demonstrations(monkeypatch: pytest.MonkeyPatc
     assert all(len(rewards) == 8 and (rewards == 77.0).sum() == 4 for rewards in sampled)
 
 
+def test_people_teach_also_in_rollouts_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    sampled: list[torch.Tensor] = []
+    gradients = Sac.gradients
+    monkeypatch.setattr(Sac, "gradients", lambda sac, batch: sampled.append(batch.rewards) or gradients(sac, batch))
+    learner = trained(ReplayLearner(spec_of(), SPACES), 1)
+    own = rollout(2)
+    own.rewards[:] = 77.0
+    learner.step([replace(own, overridden=own.valid, taught=own.valid)], 0.0)
+    assert (learner.updates_due, learner.replay.taught) == (0, 8)  # a person's rows earn no updates
+    trained(learner, 3, 4)
+    assert len(sampled) == 16
+    assert all((rewards == 77.0).sum() == 4 for rewards in sampled)
+    assert all(np.isfinite(values).all() for values in learner.weights().values())
+
+
 def test_a_rollout_that_is_not_finite_for_the_critics_is_survived() -> None:
     learner = trained(ReplayLearner(spec_of(max_gradient_norm=0.5), SPACES), 0, 1)
     wild = rollout(2)

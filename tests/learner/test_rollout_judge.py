@@ -240,6 +240,8 @@ def state_with(value: float) -> np.ndarray:
         (all_rows(ends=True, valid=False, episodes=ROWS * ENVIRONMENTS), "a row that only resets"),
         (good(overridden=~good().valid), "a row that only resets is overridden"),
         (good(overridden=good().valid), "every row is overridden: there is none to learn from"),
+        (good(overridden=good().valid, taught=good().valid), "every row is overridden: there is none to learn from"),
+        (good(taught=good().valid), "a row is taught that is not overridden"),
         # Values that no gradient survives.
         (with_value("rewards", -1.01e9), "rewards has a value beyond +-1e+09: set environment.reward_scale"),
         (with_value("frames", -1.01e15), "frames/observation has a value beyond +-1e+15: scale or clip the obs"),

@@ -259,6 +259,10 @@ def test_policy_of_another_format_is_refused_with_both_formats(tmp_path: Path, n
             OtherFormatError, match=rf"0000000002 has format {expected} of .* reads format {FORMAT} only"
         ):
             read(run if read is find_policy else directory)
+    newer = {**content, "format": FORMAT + 1, "release": "daedalus-rl 99.1"}
+    write_sealed(tmp_path / "newer", POLICY_FILES, newer)
+    with pytest.raises(OtherFormatError, match=r"daedalus-rl 99\.1 wrote it, which is newer than this one, "):
+        read_policy(tmp_path / "newer")
 
 
 @pytest.mark.parametrize(

@@ -211,6 +211,7 @@ def rollouts(draw: st.DrawFn) -> Rollout:
             )
         },
         overridden=bits(random, "|b1", shape) if draw(st.booleans()) else None,
+        taught=bits(random, "|b1", shape) if draw(st.booleans()) else None,
         matches=draw(st.none() | matches),
     )
 

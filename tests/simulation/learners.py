@@ -125,7 +125,7 @@ class LearnerProcess:
                 kernel.sleep(self.settings.train_seconds * kernel.random.random() + hang)
                 self.version += self._updates(rollouts)
                 server.rollouts.count_trained(rollouts, [])
-                server.publisher.publish_if_due(self.version, self._weights, len(rollouts))
+                server.publisher.publish_if_due(self.version, lambda: self._weights, len(rollouts))
             if kernel.now >= save_at:
                 self.disk.version, self.disk.counters = self.version, counters.state(0.0)
                 save_at = kernel.now + self.settings.checkpoint_seconds

@@ -1,0 +1,177 @@
+"""Records the episodes of an environment into a dataset, whoever plays: a policy, a bot, a person at the keyboard."""
+
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.environments.bots import make_bot
+from daedalus.actor.environments.components import stacked
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
+from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium
+from daedalus.actor.environments.info import MASK_KEY
+from daedalus.actor.environments.minari_files import Episode, MinariWriter
+from daedalus.actor.evaluation.loaded_policy import Policy
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spec import EnvironmentSpec
+
+
+class _EnoughError(Exception):
+    """All episodes are recorded."""
+
+
+class Player(Protocol):
+    """Who chooses the actions."""
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode."""
+        ...
+
+    def act(self, observation: Any, action_mask: Any) -> Any:
+        """Return the action, of the environment's own space."""
+        ...
+
+
+class PolicyPlayer:
+    """A trained policy."""
+
+    def __init__(self, policy: Policy, *, sampled: bool) -> None:
+        """`sampled`: sample the actions, in place of the most probable ones."""
+        self._policy, self._sampled = policy, sampled
+
+    def reset(self, seed: int) -> None:
+        """See Player."""
+        self._policy.reset(seed=seed)
+
+    def act(self, observation: Any, action_mask: Any) -> Any:
+        """See Player."""
+        return self._policy.act(observation, sampled=self._sampled, action_mask=action_mask)
+
+
+class BotPlayer:
+    """`random`, or `module:Bot` of the user."""
+
+    def __init__(self, name: str, space: gymnasium.Space, modules: UserModules) -> None:
+        """See make_bot."""
+        self._bot = make_bot(name, space, modules, "--by")
+
+    def reset(self, seed: int) -> None:
+        """See Player."""
+        self._bot.reset("player", seed)
+
+    def act(self, observation: Any, action_mask: Any) -> Any:
+        """See Player."""
+        return self._bot.act(observation, action_mask)
+
+
+class Recorder(gymnasium.Wrapper):
+    """Writes each episode that ends into a dataset. An episode that is left before its end is not written."""
+
+    def __init__(self, environment: gymnasium.Env, writer: MinariWriter, *, episodes: int, seed: int) -> None:
+        """Record `episodes` episodes, the first one of the environment with this seed, the next with the next."""
+        super().__init__(environment)
+        self._writer, self._wanted, self._seed = writer, episodes, seed
+        self._observations: list[Any] = []
+        self._actions: list[Any] = []
+        self._rewards: list[float] = []
+        self.returns: list[float] = []  # of the recorded episodes
+
+    @property
+    def seed(self) -> int:
+        """Seed of the next episode."""
+        return self._seed + len(self.returns)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode, with the recorder's own seed. Raises _EnoughError after the last one."""
+        if len(self.returns) >= self._wanted:
+            raise _EnoughError
+        observation, info = self.env.reset(seed=self.seed, options=options)
+        self._observations, self._actions, self._rewards = [observation], [], []
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and write the episode if it ends. Raises DatasetError."""
+        result = observation, reward, terminated, truncated, _ = self.env.step(action)
+        self._observations.append(observation)
+        self._actions.append(action)
+        self._rewards.append(float(reward))
+        if terminated or truncated:
+            episode = Episode(
+                observations=stacked(self.observation_space, self._observations),
+                actions=stacked(self.action_space, self._actions),
+                rewards=np.array(self._rewards),
+                terminated=bool(terminated),
+                truncated=bool(truncated),
+            )
+            self._writer.add(episode, seed=self.seed)
+            self.returns.append(sum(self._rewards))
+        return result
+
+    def play(self, player: Player) -> None:
+        """Let a player play all episodes. Raises EnvironmentSetupError for its faults, and DatasetError."""
+        while len(self.returns) < self._wanted:
+            player.reset(self.seed)
+            observation, info = self.reset()
+            over = False
+            while not over:
+                action = player.act(observation, info.get(MASK_KEY))
+                observation, _, terminated, truncated, info = self.step(action)
+                over = terminated or truncated
+
+    def play_by_keys(self, keys: dict[str, Any] | None, idle: Any, rate: int | None) -> None:
+        """Let a person play in a window, until all episodes are recorded or it is closed.
+
+        Args:
+          keys: an action for each key, or for several that are pressed together; None: those of the environment.
+          idle: the action while no key is pressed.
+          rate: steps a second; None: the environment's own.
+
+        Raises EnvironmentSetupError if there is no window or there are no keys, and DatasetError.
+        """
+        try:
+            from gymnasium.utils.play import MissingKeysToAction, play
+        except (ImportError, gymnasium.error.DependencyNotInstalled):
+            raise EnvironmentSetupError("the keyboard needs a window: pip install pygame-ce") from None
+        import pygame
+
+        actions = None if keys is None else {"".join(key): self._of_space(value) for key, value in keys.items()}
+        try:
+            play(self, keys_to_action=actions, noop=self._of_space(idle), fps=rate)  # pyright: ignore[reportArgumentType]
+        except _EnoughError:
+            pass
+        except (MissingKeysToAction, pygame.error, ValueError, TypeError) as error:
+            raise EnvironmentSetupError(f"the keyboard cannot play: {error}: name keys with --key K=ACTION") from None
+        finally:
+            pygame.quit()
+
+    def _of_space(self, action: Any) -> Any:
+        """Return an action as the space has it. Raises EnvironmentSetupError if it is none."""
+        space = self.action_space
+        if action is None:
+            action = np.zeros(space.shape or ())
+        action = np.asarray(action, space.dtype)
+        action = action[()] if space.shape == () else action
+        if not space.contains(action):
+            raise EnvironmentSetupError(f"the action {action} of a key, or without one, is outside {space}")
+        return action
+
+
+def recorded_environment(spec: EnvironmentSpec, modules: UserModules, render_mode: str | None) -> gymnasium.Env:
+    """Return one environment as evaluations play it, whose actions nobody repeats. Raises EnvironmentSetupError."""
+    if spec.is_game:
+        raise EnvironmentSetupError("datasets are of one agent, and this environment has several")
+    plain = as_on_gymnasium(spec.as_evaluated()).model_copy(update={"action_repeat": 1, "processes": False})
+    with creation_errors(spec.id):
+        return EnvironmentFactory(spec=plain, modules=modules, render_mode=render_mode)()
+
+
+def spec_to_record(environment: gymnasium.Env) -> Any:
+    """Return gymnasium's specification of an environment, for whoever makes it from a dataset again."""
+    for each in (environment, environment.unwrapped):
+        try:
+            if each.spec is not None:
+                each.spec.to_json()
+                return each.spec
+        except (TypeError, ValueError):  # of a wrapper, or of an argument, that JSON does not have
+            continue
+    return None

@@ -1,0 +1,175 @@
+"""`daedalus record`: record episodes of an environment into a Minari dataset."""
+
+import argparse
+import json
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.cli.arguments import add_allow_module, add_logging, allowing, command_parser, whole_number
+from daedalus.launch.logs import configure_logging, print_error, say
+from daedalus.policy.acting.program_check import PolicyError
+from daedalus.policy.saving.saved_policy import NoPolicyError
+from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, modules_of
+from daedalus.protocol.spec import EnvironmentSpec
+
+_KEYS = "keys"
+
+_DESCRIPTION = """\
+Plays episodes and records them into a Minari dataset, with the id of the environment: the policy of a run, a bot of
+your own, random actions, or you at the keyboard. `daedalus train` learns from it with --demonstrations. An episode is
+recorded when it ends; after Ctrl-C, or when the window is closed, the dataset has those that ended before."""
+
+_EXAMPLES = """\
+examples:
+  daedalus record runs/pendulum-sac-s1-20261121-101500 --out pendulum/mine-v0
+  daedalus record --env MountainCarContinuous-v0 --by my_module:Pump --out ./car
+  daedalus record --env CarRacing-v3 --by keys --key a=[-1,0.2,0] --key d=[1,0.2,0] --key w=[0,1,0] --out ./laps
+
+exit status: 0 all episodes are recorded, 1 failed or stopped, 2 bad usage"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus record`."""
+    options = command_parser("record", _DESCRIPTION, _EXAMPLES)
+    options.add_argument(
+        "directory",
+        type=Path,
+        nargs="?",
+        metavar="RUN_DIR",
+        help="a run, or one of its checkpoints, whose policy plays",
+    )
+    options.add_argument("--env", metavar="ID", help="environment to play without a run. Write module:Id for your own")
+    options.add_argument(
+        "--by",
+        metavar="PLAYER",
+        help="who plays it: module:Bot, a class with act(observation, action_mask), or `random`, or `keys` for you",
+    )
+    options.add_argument(
+        "--out",
+        required=True,
+        metavar="DATASET",
+        help="the new dataset: a folder that begins with ./, / or ~, or an id in Minari's local folder, with a version",
+    )
+    options.add_argument(
+        "--episodes", type=whole_number, default=25, metavar="N", help="episodes to record (default: %(default)s)"
+    )
+    options.add_argument(
+        "--seed", type=whole_number, default=1, metavar="S", help="seed of the first episode; the next has the next"
+    )
+    options.add_argument("--sampled", action="store_true", help="sample the policy's actions (default: greedy ones)")
+    options.add_argument("--newest", action="store_true", help="play the newest checkpoint of the run, not the best")
+    options.add_argument(
+        "--key",
+        action="append",
+        default=[],
+        metavar="K=ACTION",
+        help="with --by keys: the action, as JSON, while a key is pressed, or several together, as in wa=[-1,1,0]. May "
+        "be given several times (default: the keys that the environment names)",
+    )
+    options.add_argument("--idle", metavar="ACTION", help="with --by keys: the action without a key (default: zeros)")
+    options.add_argument("--rate", type=whole_number, metavar="N", help="with --by keys: steps a second")
+    add_allow_module(options, "the run")
+    add_logging(options)
+    return options
+
+
+def record(arguments: list[str]) -> int:
+    """Run `daedalus record` and return its exit status."""
+    parsed = parser().parse_args(arguments)
+    configure_logging(
+        parsed.log_level,
+        as_json=parsed.log_json,
+        prefix="daedalus record: ",
+        write=lambda line: say(line, sys.stderr),
+    )
+    try:
+        keys, idle = _actions(parsed)
+    except ValueError as error:
+        print_error("record", error)
+        return 2
+    if (parsed.directory is None) == (parsed.env is None) or (parsed.env is None) != (parsed.by is None):
+        print_error("record", "name either a run directory, or --env ID and --by PLAYER")
+        return 2
+    from daedalus.actor.environments.minari_files import DatasetError
+
+    try:
+        with redirect_stdout(sys.stderr):  # the environment may print
+            return _record(parsed, keys, idle)
+    except (DamagedError, DatasetError, EnvironmentSetupError, NoPolicyError, PolicyError) as error:
+        if isinstance(reason := error.__cause__, ModuleNotAllowedError):
+            print_error("record", allowing(reason, ["daedalus", "record", *arguments]))
+            return 2
+        print_error("record", error)
+        return 1
+
+
+def _actions(parsed: argparse.Namespace) -> tuple[dict[str, Any] | None, Any]:
+    """Return the actions of keys, and the one without a key. Raises ValueError."""
+    keys: dict[str, Any] = {}
+    for each in parsed.key:
+        key, equals, action = each.partition("=")
+        if not (key and equals):
+            raise ValueError(f"--key {each}: write K=ACTION, such as a=[-1]")
+        keys[key] = _json(action, f"--key {each}")
+    return keys or None, None if parsed.idle is None else _json(parsed.idle, f"--idle {parsed.idle}")
+
+
+def _json(text: str, where: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        raise ValueError(f"{where}: the action is no JSON: write a number or a list of numbers") from None
+
+
+def _record(parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any) -> int:
+    from daedalus.actor.environments.minari_files import MinariWriter
+    from daedalus.actor.evaluation.loaded_policy import load_policy
+    from daedalus.actor.evaluation.recording import (
+        BotPlayer,
+        PolicyPlayer,
+        Recorder,
+        recorded_environment,
+        spec_to_record,
+    )
+
+    by_keys, player = parsed.by == _KEYS, None
+    if parsed.directory is not None:
+        policy = load_policy(parsed.directory, newest=parsed.newest, allow_modules=parsed.allow_module)
+        spec, who = policy.spec.environment, f"the policy of {parsed.directory}, version {policy.policy_version}"
+        modules = UserModules(frozenset(parsed.allow_module), str(parsed.directory))
+        player = PolicyPlayer(policy, sampled=parsed.sampled)
+    else:
+        spec, who = EnvironmentSpec(id=parsed.env), "a person" if by_keys else parsed.by
+        # The command line itself names them.
+        named = modules_of({word: word for word in (parsed.env, parsed.by) if ":" in word})
+        modules = UserModules(frozenset({*named, *parsed.allow_module}), "the command line")
+    environment = recorded_environment(spec, modules, "rgb_array" if by_keys else None)
+    try:
+        if player is None and not by_keys:
+            player = BotPlayer(parsed.by, environment.action_space, modules)
+        spaces = environment.observation_space, environment.action_space
+        writer = MinariWriter(parsed.out, *spaces, spec_to_record(environment), algorithm=who)
+        recorder = Recorder(environment, writer, episodes=parsed.episodes, seed=parsed.seed)
+        stopped = False
+        try:
+            if player is None:
+                recorder.play_by_keys(keys, idle, parsed.rate)
+            else:
+                recorder.play(player)
+        except KeyboardInterrupt:
+            stopped = True
+    finally:
+        environment.close()
+    returns = f"; return {np.mean(recorder.returns):g} +- {np.std(recorder.returns):g}" if recorder.returns else ""
+    say(f"{writer.folder}: {writer.steps:,} steps in {writer.episodes:,} episodes{returns}", sys.__stdout__)
+    if writer.episodes < parsed.episodes:
+        how = "stopped" if stopped else "ended"
+        print_error("record", f"{how} after {writer.episodes} of {parsed.episodes} episodes")
+        return 1
+    return 0

@@ -1,0 +1,80 @@
+"""`daedalus record`, in this process: who plays, and what is in the dataset."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import minari
+import numpy as np
+import pytest
+
+from daedalus.cli.commands.record import record
+
+PUMP = """
+import numpy as np
+
+class Pump:
+    def reset(self, agent, seed):
+        self.steps = 0
+
+    def act(self, observation, action_mask):
+        self.steps += 1
+        return np.array([1.0 if observation[1] >= 0 else -1.0], np.float32) * (0.5 if self.steps % 2 else 1.0)
+"""
+
+
+@pytest.fixture
+def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "pumping.py").write_text(PUMP)
+    return lambda *words: record(["--out", "./shown", *map(str, words)])
+
+
+def test_a_bot_is_recorded_with_every_observation(recorded: Callable[..., int], tmp_path: Path) -> None:
+    assert recorded("--env", "MountainCarContinuous-v0", "--by", "pumping:Pump", "--episodes", 2, "--seed", 7) == 0
+    dataset = minari.MinariDataset(tmp_path / "shown/data")
+    environment = dataset.recover_environment()
+    for number, episode in enumerate(dataset):
+        observation, _ = environment.reset(seed=7 + number)
+        np.testing.assert_array_equal(episode.observations[0], observation)
+        for action, following, reward in zip(episode.actions, episode.observations[1:], episode.rewards, strict=True):
+            observation, earned, *_ = environment.step(action)
+            np.testing.assert_array_equal(following, observation)
+            assert reward == earned
+        assert episode.terminations[-1]
+    assert dataset.total_episodes == 2
+
+
+def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) -> None:
+    keys = ("--key", "a=0", "--key", "d=1", "--idle", "1", "--rate", "500")
+    assert recorded("--env", "CartPole-v1", "--by", "keys", *keys, "--episodes", 2) == 0
+    dataset = minari.MinariDataset(tmp_path / "shown/data")
+    assert dataset.total_episodes == 2
+    assert all((episode.actions == 1).all() for episode in dataset)  # nobody pressed a key
+    assert recorded("--env", "CartPole-v1", "--by", "keys", *keys) == 1  # the dataset is there
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "reason"),
+    [
+        (("--env", "CartPole-v1"), 2, "name either a run directory, or --env ID and --by PLAYER"),
+        (("--env", "CartPole-v1", "--by", "keys", "--key", "a=7"), 1, "the action 7 of a key"),
+        (("--env", "CartPole-v1", "--by", "keys", "--key", "a"), 2, "write K=ACTION"),
+        (("--env", "CartPole-v1", "--by", "keys"), 1, "name keys with --key"),
+        (("--env", "CartPole-v1", "--by", "pumping:Nobody"), 1, "Nobody"),
+        (("--env", "pettingzoo.classic.connect_four_v3", "--by", "random"), 1, "datasets are of one agent"),
+    ],
+)
+def test_what_cannot_be_recorded_leaves_nothing(
+    recorded: Callable[..., int],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    status: int,
+    reason: str,
+) -> None:
+    assert recorded(*words) == status
+    (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
+    assert reason in line
+    assert not (tmp_path / "shown").exists()
