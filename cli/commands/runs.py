@@ -285,9 +285,8 @@ def _prune(parsed: argparse.Namespace) -> int:
             try:
                 remove_run(entry.directory)
             except (OSError, RunDataError, SettingsError) as error:
-                print_error(
-                    "runs", f"{entry.directory} is not removed: {error}" if isinstance(error, OSError) else error
-                )
+                what = f"{entry.directory} is not removed: {error.strerror}" if isinstance(error, OSError) else error
+                print_error("runs", what)
                 failed = True
                 continue
         freed += entry.size
