@@ -226,7 +226,7 @@ def test_a_client_keeps_the_parameters_of_its_episode_when_another_learner_begin
     assert agent.parameters == begun
     agent.end_episode(terminated=True)
     walker.begin(plan((4, 4)))
-    with pytest.raises(ValueError, match="before the first act of each episode"):  # those of the last one are not played
+    with pytest.raises(ValueError, match="before the first act of each episode"):  # not those of the last
         agent.act(np.zeros(1, np.float32))
     assert agent.parameters == {"stones": 4}
 
