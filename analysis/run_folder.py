@@ -77,8 +77,8 @@ class RunEntry:
 
     @property
     def score(self) -> Score | None:
-        """What the run has reached; None if nothing is known of it, or of self-play, whose returns say nothing."""
-        if self.run is None:
+        """What the run has reached; None if that or its task is unknown, or for self-play, whose returns say nothing."""
+        if self.run is None or not self.environment:
             return None
         task = self.task
         evaluation = self.run.summary.get("evaluation")
@@ -208,10 +208,10 @@ def _begins_with(verdict: Verdict) -> list[Path]:
     """Return the run from whose weights a kept run without a checkpoint would begin again, and what it is in."""
     if checkpoints(verdict.entry.directory):
         return []
-    with suppress(RunDataError):
+    with suppress(RunDataError, ValueError):  # it may be no path
         recorded = (read_json(verdict.entry.directory / VERSIONS) or {}).get("init_from")
         if isinstance(recorded, str):
-            initial = Path(recorded).resolve()
+            initial = Path(os.path.realpath(recorded))
             return [initial, *initial.parents]
     return []
 
@@ -229,6 +229,8 @@ def _why_kept(entry: RunEntry, *, is_best: bool, unfinished: bool) -> str:
         return f"the best of {entry.environment}: {entry.score}"
     if not unfinished and (entry.run is None or entry.run.unfinished):
         return "it is not finished; --unfinished removes it"
+    if not entry.environment:
+        return "its environment is not known, so that nothing ranks it: remove it yourself"
     if entry.run is not None and not entry.run.unfinished and entry.score is None:
         return "its returns are of self-play, which rank nothing: remove it yourself"
     try:

@@ -202,3 +202,12 @@ def test_a_run_whose_weights_another_still_needs_is_kept(folder: Path, capsys: p
     versions = json.loads((waiting / "versions.json").read_text())
     (waiting / "versions.json").write_text(json.dumps({**versions, "init_from": str(folder / "runs" / "source")}))
     assert "keeps   runs/source: runs/waiting begins with its weights" in said(capsys, "prune")
+    (waiting / "versions.json").write_text(json.dumps({"init_from": "no path\0"}))
+    assert "removes runs/source" in said(capsys, "prune")
+
+
+def test_a_run_whose_task_is_not_known_is_not_ranked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        (record(folder / "runs" / name) / "config.toml").write_text("")
+    assert said(capsys, "prune", "--best", "0").count("its environment is not known") == 2
+    assert "no run has a return that can be compared" in said(capsys, "best", status=1)
