@@ -77,7 +77,7 @@ class RunEntry:
 
     @property
     def score(self) -> Score | None:
-        """What the run has reached; None if that or its task is unknown, or for self-play, whose returns say nothing."""
+        """What the run has reached. None: that or its task is unknown, or returns of self-play say nothing of it."""
         if self.run is None or not self.environment:
             return None
         task = self.task
