@@ -88,8 +88,8 @@ def seated_space(spec: ActorSpec, seat: MatchSeat | None, space: gymnasium.Space
         )
     if spec.lessons and len(seat.seats) > 1:
         raise ActorError(
-            f"this run has lessons for {', '.join(sorted(spec.lessons))}, which each seat of the match would get another"
-            " value of: start the run without lessons, or host one seat"
+            f"this run has lessons for {', '.join(sorted(spec.lessons))}, of which each seat of the match would get "
+            "another value: start the run without lessons, or host one seat"
         )
     name = seat.seats[seat.number]
     if environment.agents and name not in environment.agents:

@@ -237,7 +237,7 @@ def test_the_seats_of_a_match_do_not_play_lessons_of_their_own() -> None:
     walker = Walker()
     two, one = (match_seats(seats, turns=True)[0] for seats in (("a", "b"), ("a",)))
     space, spec = walker.path.observation_space, walker.spec.for_actors()
-    with pytest.raises(ActorError, match="lessons for stones, which each seat of the match would get another value of"):
+    with pytest.raises(ActorError, match="lessons for stones, of which each seat of the match would"):
         seated_space(spec, two, space)
     assert seated_space(spec, one, space) == space
 
