@@ -139,7 +139,7 @@ def read_entry(directory: Path) -> RunEntry:
         labels=labels,
         settings=settings,
         run=run,
-        problem="; ".join(problems),
+        problem="; ".join(dict.fromkeys(problems)),
         made_by=made_by,
         written_by=written_by,
         size=sum(sizes_of(directory).values()),
