@@ -6,7 +6,7 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -117,17 +117,24 @@ with private_folder() as folder:
 """
 
 
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """A folder whose path leaves room for that of a socket."""
+    with tempfile.TemporaryDirectory(prefix="short-", dir="/tmp") as folder:
+        yield Path(folder)
+
+
 def test_folders_of_killed_processes_are_removed_by_the_next_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(short_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(short_path))
     with private_address() as address:
         alive = path_of(address).parent
         subprocess.run([sys.executable, "-c", KILLED], capture_output=True, check=False)
-        (dead,) = (entry for entry in tmp_path.iterdir() if entry != alive)
+        (dead,) = (entry for entry in short_path.iterdir() if entry != alive)
         assert dead.name.startswith("daedalus-")
-        home, theirs, unknown = tmp_path / "home", tmp_path / "daedalus-link", tmp_path / "daedalus-unknown"
+        home, theirs, unknown = short_path / "home", short_path / "daedalus-link", short_path / "daedalus-unknown"
         for folder in (home, unknown):
             folder.mkdir(mode=0o700)
         (home / "lock").touch(0o600)
@@ -139,7 +146,7 @@ def test_folders_of_killed_processes_are_removed_by_the_next_one(
                 return not dead.exists()
 
         until(cleaned)
-        assert {entry.name for entry in tmp_path.iterdir()} == {alive.name, home.name, theirs.name, unknown.name}
+        assert {entry.name for entry in short_path.iterdir()} == {alive.name, home.name, theirs.name, unknown.name}
         assert (home / "lock").exists()
 
 
