@@ -398,7 +398,9 @@ class Learner:
         cloning, updates = self._cloning, self._spec.cloning_updates
         if cloning is None or not updates:
             return ""
-        self._observations.add(cloning.observations())
+        if self._observations.moments:
+            for observations in cloning.observations():
+                self._observations.add(observations)
         before, optimizer = cloning.held_out(), build_optimizer(self._spec, self._flat.values)
         rate = self._flat.values.new_tensor(self.learning_rate(0.0))
         for _ in range(updates):
