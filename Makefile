@@ -21,7 +21,8 @@ CONSTRAINTS ?= constraints.txt
 TORCH ?= torch==2.13.0
 CORE_EXTRAS = learner certs gateway monitoring analysis pettingzoo
 CORE = tests/algorithms tests/policy tests/protocol tests/transport tests/simulation tests/learner \
-	tests/end_to_end/test_in_one_process.py tests/end_to_end/test_router.py
+	tests/end_to_end/test_in_one_process.py tests/end_to_end/test_router.py \
+	--ignore=tests/learner/test_demonstrations.py
 test-core:
 	$(PYTHON) -m venv build/core
 	build/core/bin/pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) $(TORCH)

@@ -41,6 +41,7 @@ EVALUATION_RETURN = "evaluation_return_mean"  # during training
 _NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
 _SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
 _LARGEST = 1e300
+_MOST_STEPS = 2.0**63
 _MAX_METRICS_BYTES = 4 << 30  # a month of an earlier release, which did not merge old rows
 _LONGEST_LINE = MAX_COLUMNS << 8  # bytes
 _MAX_OUTPUT_BYTES = 16 << 10
@@ -278,6 +279,8 @@ def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     if not len(values):
         raise NoMetricsError(nothing)
     found = dict(zip(header, values.T, strict=True))
+    if not (np.abs(found.get(ENV_STEPS, values[:0])) < _MOST_STEPS).all():
+        raise RunDataError(f"{path} is damaged: {ENV_STEPS} has a value that is no number of steps")
     kept = lasting(*(found[name] for name in (ENV_STEPS, SECONDS) if name in found))
     return {name: column[kept] for name, column in found.items()}
 

@@ -31,7 +31,7 @@ from daedalus.policy.saving.sealed import MANIFEST, DamagedError, SealedDirector
 from daedalus.policy.user_modules import module_of
 from daedalus.protocol.keys import is_name
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.texts import is_secret
+from daedalus.protocol.texts import bounded_text, is_secret
 
 FORMAT = 1
 REPLAY = "replay"  # folder of a replay buffer (learner/training/replay_files.py, which needs torch)
@@ -194,9 +194,7 @@ def write_archive(directory: Path, output: Path, *, replay: bool = True) -> tupl
         except BaseException:
             output.unlink(missing_ok=True)
             raise
-        notes = [f"not in it, because no run has such a file: {', '.join(others[:_MOST_NAMED])}{_more(others)}"] * bool(
-            others
-        )
+        notes = [f"not in it, because no run has such a file: {listed(others)}"] if others else []
         if buffer:
             size = sum(file.stat().st_size for file in buffer) / 2**20
             notes.append(
@@ -207,8 +205,10 @@ def write_archive(directory: Path, output: Path, *, replay: bool = True) -> tupl
         return written, [*notes, *_damaged(directory, kept, sha256), *_needed(directory)]
 
 
-def _more(found: Sequence[str]) -> str:
-    return f" and {len(found) - _MOST_NAMED:,} more" if len(found) > _MOST_NAMED else ""
+def listed(paths: Sequence[str]) -> str:
+    """Return the first of some paths, which somebody else may have chosen, in one line, and how many more there are."""
+    more = f" and {len(paths) - _MOST_NAMED:,} more" if len(paths) > _MOST_NAMED else ""
+    return f"{', '.join(bounded_text(path) for path in paths[:_MOST_NAMED])}{more}"
 
 
 def _is_replay(file: Path, directory: Path) -> bool:
@@ -227,7 +227,10 @@ def _write(file: BinaryIO, directory: Path, kept: Sequence[Path], left_out: Sequ
                 found, hashing = os.fstat(source.fileno()), _Hashing(source)
                 if found.st_size > _LARGEST_FILE:
                     raise ArchiveError(f"{path} has more than 8 GiB, the most that a file of an archive may have")
-                archive.addfile(_header(f"{run}/{name}", found.st_size, int(found.st_mtime)), hashing)
+                try:
+                    archive.addfile(_header(f"{run}/{name}", found.st_size, int(found.st_mtime)), hashing)
+                except ValueError:
+                    raise ArchiveError(f"{path} has a name of more than 100 characters: rename the file") from None
             sha256[name] = hashing.digest.hexdigest()
         contents = _Contents(format=FORMAT, run=run, release=__version__, files=sha256, left_out=list(left_out))
         data = contents.model_dump_json(indent=1).encode()
@@ -331,7 +334,7 @@ def read_archive(path: Path) -> RunArchive:
     return RunArchive(
         path=path,
         run=run,
-        release=contents.release,
+        release=bounded_text(contents.release, 40),
         members=[
             Member(path=name, begin=member.begin, size=member.size, modified=member.modified)
             for name, member in zip(found, members, strict=True)
@@ -385,8 +388,8 @@ def _contents(path: Path, file: BinaryIO, member: Member) -> _Contents:
         head = _Head.model_validate_json(data)
         if head.format != FORMAT:
             raise ArchiveError(
-                f"{path} has format {head.format} of archives, and this release reads format {FORMAT}: restore it with "
-                f"the release that wrote it ({head.release[:20]!r}), or a newer one"
+                f"{path} has format {str(head.format)[:20]} of archives, and this release reads format {FORMAT}: "
+                f"restore it with the release that wrote it ({head.release[:20]!r}), or a newer one"
             )
         return _Contents.model_validate_json(data)
     except ValidationError:

@@ -21,7 +21,7 @@ from daedalus.analysis.recorded_run import (
     read_run,
     read_run_settings,
 )
-from daedalus.analysis.run_archive import module_names, parts_of
+from daedalus.analysis.run_archive import listed, module_names, parts_of
 from daedalus.analysis.run_selection import Labels, read_labels
 from daedalus.learner.run.run_directory import VERSIONS, read_config, releases_of
 from daedalus.learner.run.run_files import RunDataError, read_json
@@ -33,7 +33,7 @@ from daedalus.protocol.texts import bounded_text, short_number
 
 # Settings that make the task of evaluations another one, so that returns cannot be compared.
 _IN_TRAINING = "last training episodes"
-_TASK = ("id", "kwargs", "wrap", "max_episode_steps", "agents")
+_TASK = ("id", "kwargs", "parameters", "wrap", "max_episode_steps", "agents")
 _MOST_SIZES = 3  # files and folders of a run, for a person
 _TRACKERS = ("wandb",)  # folders that a tracker makes in a run
 
@@ -77,10 +77,10 @@ class RunEntry:
 
     @property
     def score(self) -> Score | None:
-        """What the run has reached; None if nothing is known of it, or of self-play, whose returns say nothing."""
-        if self.run is None:
+        """What the run has reached. None: that or its task is unknown, or returns of self-play say nothing of it."""
+        if self.run is None or not self.environment:
             return None
-        task = value_text([self.settings.get(f"environment.{name}") or None for name in _TASK])
+        task = self.task
         evaluation = self.run.summary.get("evaluation")
         matches = evaluation.get("matches") if isinstance(evaluation, dict) else None
         if isinstance(matches, dict):
@@ -91,12 +91,17 @@ class RunEntry:
             of = "final evaluation"
         if self.run.evaluation_return is not None:
             return Score(value=self.run.evaluation_return, of=of, task=task)
-        if math.isnan(self.run.training_return) or matches is not None:
+        if not math.isfinite(self.run.training_return) or matches is not None:
             return None
         if not self.run.trains_true_task:
             shaping = [self.settings.get(f"environment.{name}") for name in ("training_kwargs", "no_reward_limit")]
             task += value_text([*shaping, self.run.lessons])
         return Score(value=self.run.training_return, of=_IN_TRAINING, task=task)
+
+    @property
+    def task(self) -> str:
+        """What evaluations of the run play: the settings that tell its task from others."""
+        return value_text([self.settings.get(f"environment.{name}") or None for name in _TASK])
 
     @property
     def is_evaluated(self) -> bool:
@@ -134,7 +139,7 @@ def read_entry(directory: Path) -> RunEntry:
         labels=labels,
         settings=settings,
         run=run,
-        problem="; ".join(problems),
+        problem="; ".join(dict.fromkeys(problems)),
         made_by=made_by,
         written_by=written_by,
         size=sum(sizes_of(directory).values()),
@@ -184,7 +189,8 @@ def prune_plan(entries: Sequence[RunEntry], *, best: int, unfinished: bool) -> l
       unfinished: remove also runs that could be resumed, and those without a result.
     """
     done = [entry for entry in entries if entry.run is not None and not entry.run.unfinished]
-    kept_as_best = {entry.directory for entry in best_runs(done, best)}
+    contests = [done, entries] if unfinished else [done]  # a run that is not finished displaces none that is
+    kept_as_best = {entry.directory for contest in contests for entry in best_runs(contest, best)}
     verdicts = [
         Verdict(entry, _why_kept(entry, is_best=entry.directory in kept_as_best, unfinished=unfinished))
         for entry in entries
@@ -202,10 +208,10 @@ def _begins_with(verdict: Verdict) -> list[Path]:
     """Return the run from whose weights a kept run without a checkpoint would begin again, and what it is in."""
     if checkpoints(verdict.entry.directory):
         return []
-    with suppress(RunDataError):
+    with suppress(RunDataError, ValueError):  # it may be no path
         recorded = (read_json(verdict.entry.directory / VERSIONS) or {}).get("init_from")
         if isinstance(recorded, str):
-            initial = Path(recorded).resolve()
+            initial = Path(os.path.realpath(recorded))
             return [initial, *initial.parents]
     return []
 
@@ -223,26 +229,43 @@ def _why_kept(entry: RunEntry, *, is_best: bool, unfinished: bool) -> str:
         return f"the best of {entry.environment}: {entry.score}"
     if not unfinished and (entry.run is None or entry.run.unfinished):
         return "it is not finished; --unfinished removes it"
+    if not entry.environment:
+        return "its environment is not known, so that nothing ranks it: remove it yourself"
     if entry.run is not None and not entry.run.unfinished and entry.score is None:
         return "its returns are of self-play, which rank nothing: remove it yourself"
     try:
         others = [name for name in parts_of(entry.directory)[1] if name not in _TRACKERS]
     except OSError as error:
         return f"it cannot be searched: {error.strerror}"
-    return f"it has files that are not of a run, such as {others[0]}" if others else ""
+    return f"it has files that are not of a run, such as {listed(others[:1])}" if others else ""
 
 
 def remove_run(directory: Path) -> None:
-    """Remove a run that no process trains. Nobody sees a part of it. Raises RunInUseError, SettingsError, OSError."""
-    aside = directory.with_name(f".{directory.name}.pruned")
+    """Remove a run that no process trains. Nobody sees a part of it.
+
+    Raises RunInUseError, SettingsError, and RunDataError if a part cannot be removed; OSError if nothing can.
+    """
+    path = directory.resolve()  # of `.`, too
+    aside = path.with_name(f".{path.name}.pruned")
     with lock_idle(directory) as lock:
         if read_labels(directory).tags:
             raise RunInUseError(f"{directory} has got a tag meanwhile")
         if sys.platform == "win32":  # an open file holds its folder
             lock.close()
         shutil.rmtree(aside, ignore_errors=True)
-        directory.rename(aside)
-        shutil.rmtree(aside)
+        path.rename(aside)
+        try:
+            shutil.rmtree(aside)
+        except OSError as error:
+            raise RunDataError(
+                f"{directory} is removed in part: remove the rest, {aside}, yourself ({error.strerror})"
+            ) from None
+
+
+def remove_interrupted(folder: Path) -> None:
+    """Remove what is left in a folder of runs whose removal was interrupted."""
+    for aside in folder.glob(".*.pruned"):
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def described(entry: RunEntry) -> list[str]:

@@ -31,12 +31,21 @@ def find_runs(paths: Iterable[Path]) -> list[Path]:
     A folder with @TAG stands for those with the tag. A run that has several paths is returned once, by the first of
     them. Raises RunDataError for a path that is none of these.
     """
+    try:
+        return _found(paths)
+    except OSError as error:  # such as a name that is too long
+        raise RunDataError(f"{error.filename}: {error.strerror}") from None
+
+
+def _found(paths: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if is_run(path):
             found.append(path)
             continue
         folder, tag = split_tag(path)
+        if tag and is_run(folder):
+            raise RunDataError(f"{folder} is a run directory: a tag is that of runs in a folder, such as runs@{tag}")
         inside = _runs_in(folder)
         if not inside:
             raise RunDataError(
@@ -113,13 +122,18 @@ def read_labels(run: Path) -> Labels:
     return Labels(tuple(sorted(set(tags))), bounded_text(note, _LONGEST_NOTE))
 
 
-def change_tag(run: Path, tag: str, *, remove: bool) -> None:
-    """Give a run a tag, or take it away. Raises RunDataError."""
+def change_tag(run: Path, tag: str, *, remove: bool) -> bool:
+    """Give a run a tag, or take it away, and return whether that changes its tags. Raises RunDataError."""
     before = read_labels(run)
     tags = {*before.tags} - {tag} if remove else {*before.tags, checked_tag(tag)}
     if len(tags) > _MOST_TAGS:
-        raise RunDataError(f"{run} has {_MOST_TAGS} tags, which is the most: remove one with --remove")
+        raise RunDataError(
+            f"{run} has {_MOST_TAGS} tags, which is the most: take one away with `daedalus runs tag TAG {run} --remove`"
+        )
+    if tags == {*before.tags}:
+        return False
     _write(run, replace(before, tags=tuple(sorted(tags))))
+    return True
 
 
 def change_note(run: Path, note: str) -> None:

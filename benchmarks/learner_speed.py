@@ -53,6 +53,7 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
     )
     flat = FlatParameters(network.learned_parameters())
     optimizer = Adam(flat.values, 1e-5)
+    rate, skipped = flat.values.new_tensor(1e-4), flat.values.new_zeros(())
     shape = (rows, environments, *space.stacked_shape)
     observations = torch.randint(0, 256, shape).to(getattr(torch, space.dtype))
     state = torch.zeros(environments, network.state_size)
@@ -65,7 +66,7 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
         loss = values.square().mean() - logits.log_softmax(-1).gather(-1, actions).mean()
         flat.gradients.copy_(flat.differentiated(loss))
         flat.clip_gradients(0.5)
-        optimizer.step(flat.values, flat.gradients, 1e-4)
+        optimizer.step(flat.values, flat.gradients, rate, skipped)
 
     return update
 

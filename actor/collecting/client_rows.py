@@ -100,9 +100,9 @@ class ClientRows:
         return self._drawn
 
     def take_over(self, rows: "ClientRows") -> None:
-        """Go on with the parameters of rows under another learner, whose episode may be running."""
-        known = rows._drawn or rows._playing
-        if self.draws is not None and known.keys() == self.draws.true_task.keys():
+        """Go on with the parameters of rows under another learner: of their running episode, or of the next."""
+        known = rows._playing if rows.in_episode else rows._drawn
+        if self.draws is not None and known is not None and known.keys() == self.draws.true_task.keys():
             self._drawn = known
 
     def use(self, runtime: PolicyRuntime, plan: LessonPlan | None = None) -> None:

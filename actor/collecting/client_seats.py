@@ -86,6 +86,11 @@ def seated_space(spec: ActorSpec, seat: MatchSeat | None, space: gymnasium.Space
             "the seats of the match act together, but the run plays no game with several agents, and would count each "
             "action as a step: start the learner with --set environment.backend=pettingzoo"
         )
+    if spec.lessons and len(seat.seats) > 1:
+        raise ActorError(
+            f"this run has lessons for {', '.join(sorted(spec.lessons))}, of which each seat of the match would get "
+            "another value: start the run without lessons, or host one seat"
+        )
     name = seat.seats[seat.number]
     if environment.agents and name not in environment.agents:
         raise ActorError(

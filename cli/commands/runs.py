@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     note = verbs.add_parser("note", help="replace the note of a run")
     note.add_argument("directory", type=Path, metavar="RUN_DIR", help="the run")
     note.add_argument("text", metavar="TEXT", help="the note; '' removes it")
-    best = verbs.add_parser("best", help="print the path of the best run of each environment")
+    best = verbs.add_parser("best", help="print the path of the best run of each task")
     _add_runs(best)
     archive = verbs.add_parser("archive", help="write one file with everything to repeat or resume a run")
     archive.add_argument("directory", type=Path, metavar="RUN_DIR", help="a run that nobody trains now")
@@ -181,13 +181,13 @@ def _mib(size: int) -> str:
 
 def _show(parsed: argparse.Namespace) -> int:
     if parsed.path.is_file():
-        from daedalus.analysis.run_archive import read_archive
+        from daedalus.analysis.run_archive import listed, read_archive
 
         archive = read_archive(parsed.path)
         archive.verify()
         say(f"{_described(parsed.path, archive)}; all checksums are right")
         if archive.left_out:
-            say(f"  not in it: {', '.join(archive.left_out)}")
+            say(f"  not in it: {listed(archive.left_out)}")
         say(f"  restore it with: {shlex.join(['daedalus', 'runs', 'restore', str(parsed.path)])}")
         return 0
     from daedalus.analysis.run_folder import described, read_entry
@@ -211,8 +211,10 @@ def _tag(parsed: argparse.Namespace) -> int:
 
     checked_tag(parsed.tag)
     for directory in find_runs(parsed.directories):
-        change_tag(directory, parsed.tag, remove=parsed.remove)
-        say(f"{directory}: tag {parsed.tag} {'removed' if parsed.remove else 'added'}")
+        if change_tag(directory, parsed.tag, remove=parsed.remove):
+            say(f"{directory}: tag {parsed.tag} {'removed' if parsed.remove else 'added'}")
+        else:
+            say(f"{directory}: it {'has no' if parsed.remove else 'has the'} tag {parsed.tag}; nothing changed")
     return 0
 
 
@@ -231,9 +233,9 @@ def _best(parsed: argparse.Namespace) -> int:
 
     entries = [read_entry(directory) for directory in find_runs(parsed.directories)]
     found = best_runs(entries)
-    evaluated = {entry.environment for entry in found if entry.is_evaluated}
+    evaluated = {entry.task for entry in found if entry.is_evaluated}
     for entry in found:
-        if entry.is_evaluated or entry.environment not in evaluated:
+        if entry.is_evaluated or entry.task not in evaluated:
             print_error("runs", f"{entry.environment}: return {entry.score}")
             say(str(entry.directory))
     if not found:
@@ -266,7 +268,7 @@ def _restore(parsed: argparse.Namespace) -> int:
 
 
 def _prune(parsed: argparse.Namespace) -> int:
-    from daedalus.analysis.run_folder import prune_plan, read_entry, remove_run
+    from daedalus.analysis.run_folder import prune_plan, read_entry, remove_interrupted, remove_run
     from daedalus.analysis.run_selection import find_runs
 
     entries = [read_entry(directory) for directory in find_runs(parsed.directories)]
@@ -276,12 +278,15 @@ def _prune(parsed: argparse.Namespace) -> int:
             say(f"keeps   {verdict.entry.directory}: {verdict.kept}")
     removed = [verdict.entry for verdict in plan if not verdict.kept]
     freed, failed = 0, False
+    for folder in {entry.directory.resolve().parent for entry in entries if parsed.yes}:
+        remove_interrupted(folder)
     for entry in removed:
         if parsed.yes:
             try:
                 remove_run(entry.directory)
             except (OSError, RunDataError, SettingsError) as error:
-                print_error("runs", f"{entry.directory} is not removed: {error}")
+                what = f"{entry.directory} is not removed: {error.strerror}" if isinstance(error, OSError) else error
+                print_error("runs", what)
                 failed = True
                 continue
         freed += entry.size

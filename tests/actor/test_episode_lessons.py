@@ -14,8 +14,10 @@ from test_client_collector import IDENTITY, Played
 
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.collecting.client_collector import ClientCollector
+from daedalus.actor.collecting.client_seats import match_seats, seated_space
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.errors import ActorError
 from daedalus.learner.run.lesson_progress import lessons_violation
 from daedalus.protocol.lessons import LessonPlan, LessonRange, LessonSpec
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -225,7 +227,19 @@ def test_a_client_keeps_the_parameters_of_its_episode_when_another_learner_begin
     agent.act(np.zeros(1, np.float32))
     assert agent.parameters == begun
     agent.end_episode(terminated=True)
+    walker.begin(plan((4, 4)))
+    with pytest.raises(ValueError, match="before the first act of each episode"):  # not those of the last
+        agent.act(np.zeros(1, np.float32))
     assert agent.parameters == {"stones": 4}
+
+
+def test_the_seats_of_a_match_do_not_play_lessons_of_their_own() -> None:
+    walker = Walker()
+    two, one = (match_seats(seats, turns=True)[0] for seats in (("a", "b"), ("a",)))
+    space, spec = walker.path.observation_space, walker.spec.for_actors()
+    with pytest.raises(ActorError, match="lessons for stones, of which each seat of the match would"):
+        seated_space(spec, two, space)
+    assert seated_space(spec, one, space) == space
 
 
 def test_agents_whose_rollouts_are_sent_as_one_acknowledge_all_their_episodes() -> None:

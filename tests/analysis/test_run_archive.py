@@ -110,6 +110,23 @@ def test_a_run_that_is_damaged_is_archived_and_named(folder: Path, capsys: pytes
     )
 
 
+def test_a_file_whose_name_does_not_fit_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = record(folder / "run")
+    (run / f"events.out.tfevents.1764300000.{'h' * 64}.12345.0").touch()  # of a host with the longest name
+    assert ".12345.0 has a name of more than 100 characters: rename" in said(capsys, "archive", "run", "x", status=1)
+    assert not (folder / "x").exists()
+
+
+def test_texts_of_an_archive_are_shown_in_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left_out = ["a\nkeeps\x1b[31m", *(f"{number}" * 5000 for number in range(100))]
+    (folder / "x.tar").write_bytes(made(ONE, release="1\n2" * 1000, left_out=left_out))
+    lines = said(capsys, "show", "x.tar").splitlines()
+    assert len(lines) == 3
+    assert max(map(len, lines)) < 4000
+    assert lines[1].startswith("  not in it: a keeps [31m, 00000")
+    assert lines[1].endswith(" and 91 more")
+
+
 def test_nothing_is_overwritten_and_a_running_run_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = record(folder / "run")
     (folder / "there.tar").write_text("mine")
@@ -195,6 +212,7 @@ HOSTILE = {
     "missing": (made({}, listed={"config.toml": "0"}), "are not those that"),
     "wrong checksum": (made(ONE, listed={"config.toml": "0" * 64}), "differs from its checksum"),
     "newer": (made(ONE, format=9, release="4.5.6"), "has format 9 of archives.*4.5.6"),
+    "large format": (made(ONE, format=10**4000), "has format 10{19} of archives"),
     "no list": (made(ONE, files=7), "archive.json cannot be read"),
     "cut": (made(ONE)[:1024], "ends too early"),
     "many": (made({f"x/events.out.{number}": b"" for number in range(20_001)}), "has more than 20,000 files"),

@@ -59,6 +59,8 @@ def test_tags_and_notes_are_kept_in_the_run_and_select_runs(folder: Path, capsys
         (["list", "runs@none"], "no run in runs has the tag 'none': the tags there are paper"),
         (["list", "runs@two words"], "the tag 'two words' must be"),
         (["list", "elsewhere@paper"], "elsewhere does not exist: name a run directory, or a folder"),
+        (["list", "runs/a@paper"], "runs/a is a run directory: a tag is that of runs in a folder, such as runs@paper"),
+        (["list", "x" * 5000 + "@paper"], "File name too long"),
         (["note", "runs/a", "token=abcdefgh"], "the note has a password, a token"),
         (["note", "runs", "text"], "runs is a folder of run directories: name one of them"),
         (["note", "runs/a", "x" * 3000], "the note has more than 2,000 bytes"),
@@ -83,6 +85,13 @@ def test_damaged_labels_are_named_and_keep_their_run(folder: Path, capsys: pytes
         assert "keeps   runs/a:" in said(capsys, "prune")
 
 
+@pytest.mark.parametrize("steps", ["nan", "inf", "1e300", ""])
+def test_a_number_of_steps_that_is_none_is_damage(folder: Path, capsys: pytest.CaptureFixture[str], steps: str) -> None:
+    metrics = record(folder / "runs" / "a") / "metrics.csv"
+    metrics.write_text(metrics.read_text().replace(",3000,", f",{steps},"))
+    assert "env_steps has a value that is no number of steps" in str(listed(capsys)["runs/a"]["problem"])
+
+
 def test_the_best_is_found_by_evaluations_of_one_task(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record(folder / "runs" / "trained", evaluation=None, returns=(1.0, 2.0, 499.0))
     record(folder / "runs" / "good", evaluation=480.0)
@@ -94,6 +103,9 @@ def test_the_best_is_found_by_evaluations_of_one_task(folder: Path, capsys: pyte
     assert said(capsys, "best", "runs/trained").splitlines() == ["runs/trained"]
     assert "no run has a return that can be compared" in said(capsys, "best", "runs/self_play", status=1)
     assert [name for name, run in listed(capsys).items() if run["best"]] == ["runs/good", "runs/other", "runs/trained"]
+    parameters = ["environment.parameters={length = 0.7}"]
+    record(folder / "runs" / "longer", evaluation=None, settings=parameters, returns=(1.0, 2.0, 3.0))
+    assert said(capsys, "best").splitlines() == ["runs/other", "runs/good", "runs/longer"]  # nobody evaluated its task
 
 
 def test_prune_removes_only_what_is_neither_tagged_nor_best_nor_in_use(
@@ -131,8 +143,31 @@ def test_prune_removes_only_what_is_neither_tagged_nor_best_nor_in_use(
         ["best", "tagged", "running", "own_files", "stopped", "self_play", "linked", "notes.txt"]
     )
     assert (folder / "elsewhere" / "metrics.csv").exists()
+    assert "removes runs/stopped" in said(capsys, "prune", "--unfinished", "--best", "0")
+    assert "keeps   runs/stopped: the best of CartPole-v1: 3 (last training" in said(capsys, "prune", "--unfinished")
     said(capsys, "prune", "--yes", "--unfinished", "--best", "0")
     assert not {"stopped", "best"} & {entry.name for entry in place.iterdir()}
+
+
+def test_a_removal_that_fails_or_was_interrupted_leaves_nothing_unsaid(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b"):
+        record(folder / "runs" / name, evaluation=1.0 if name == "a" else 2.0)
+    (folder / "runs" / ".c.pruned").mkdir()
+    with monkeypatch.context() as patch:
+
+        def fail(path: Path, *, ignore_errors: bool = False) -> None:
+            if not ignore_errors:
+                raise PermissionError(13, "Permission denied")
+
+        patch.setattr("shutil.rmtree", fail)
+        error = said(capsys, "prune", "--yes", status=1)
+    assert error.rstrip().endswith("/runs/.a.pruned, yourself (Permission denied)")
+    assert error.startswith("daedalus runs: runs/a is removed in part")
+    monkeypatch.chdir("runs/b")
+    said(capsys, "prune", ".", "--best", "0", "--yes")
+    assert list((folder / "runs").iterdir()) == []
 
 
 def test_a_run_that_is_resumed_or_tagged_after_the_plan_is_not_removed(
@@ -167,3 +202,12 @@ def test_a_run_whose_weights_another_still_needs_is_kept(folder: Path, capsys: p
     versions = json.loads((waiting / "versions.json").read_text())
     (waiting / "versions.json").write_text(json.dumps({**versions, "init_from": str(folder / "runs" / "source")}))
     assert "keeps   runs/source: runs/waiting begins with its weights" in said(capsys, "prune")
+    (waiting / "versions.json").write_text(json.dumps({"init_from": "no path\0"}))
+    assert "removes runs/source" in said(capsys, "prune")
+
+
+def test_a_run_whose_task_is_not_known_is_not_ranked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        (record(folder / "runs" / name) / "config.toml").write_text("")
+    assert said(capsys, "prune", "--best", "0").count("its environment is not known") == 2
+    assert "no run has a return that can be compared" in said(capsys, "best", status=1)

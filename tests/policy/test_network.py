@@ -225,7 +225,7 @@ def test_layouts_of_one_frame(name: str) -> None:
 
 @pytest.mark.parametrize("name", ENCODERS)
 def test_convolutions_of_one_grey_frame_have_channels_last(name: str) -> None:
-    made: list[Tensor] = []
+    made: list[Any] = []
     whole = build_encoder(PolicySpec(encoder=name), {NAME: ArraySpace(shape=(40, 44), dtype="uint8")})
     for module in whole.modules():
         if isinstance(module, nn.Conv2d):
