@@ -1,6 +1,7 @@
 """Records the episodes of an environment into a dataset, whoever plays: a policy, a bot, a person at the keyboard."""
 
 import copy
+import warnings
 from typing import Any, Protocol
 
 import gymnasium
@@ -131,7 +132,9 @@ class Recorder(gymnasium.Wrapper):
         Raises EnvironmentSetupError if there is no window or there are no keys, and DatasetError.
         """
         try:
-            from gymnasium.utils.play import MissingKeysToAction, play
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # its plots, which are not used, lack a window or matplotlib
+                from gymnasium.utils.play import MissingKeysToAction, play
         except (ImportError, gymnasium.error.DependencyNotInstalled):
             raise EnvironmentSetupError("the keyboard needs a window: pip install pygame-ce") from None
         import pygame
