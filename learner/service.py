@@ -109,7 +109,7 @@ class LearnerService:
             from daedalus.learner.training.replay_learner import ReplayLearner
 
             if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):
-                return self._stopped_without_actors()
+                return self._stopped_early("before the first actor joined")
             spaces = self._context.fleet.spaces
             assert spaces is not None
             spec = self._context.spec
@@ -121,18 +121,20 @@ class LearnerService:
             else:
                 learner = Learner(spec.training, spec.policy, spaces, self._beginning.modules)
             self._beginning.load_into(learner, spec, self._context.progress)
-            self._read_demonstrations(learner)
+            if not self._read_demonstrations(learner):
+                return self._stopped_early("before the first update")
             checkpointer, loop = self._training_of(learner)
             if self._beginning.initial is not None:
                 checkpointer.begin()  # a learner that is killed before its first checkpoint continues from this one
             if self._beginning.restored is None and not self._server.await_actor(self._heartbeat.beat):
-                return self._stopped_without_actors()
+                return self._stopped_early("before the first actor joined")
             return self._learn(learner, checkpointer, loop)
         finally:
             self._server.close(self._why_stopped)  # unless it is closed
             self._heartbeat.clear()
 
-    def _read_demonstrations(self, learner: "Learner") -> None:
+    def _read_demonstrations(self, learner: "Learner") -> bool:
+        """Let the learner have its demonstrations, and imitate them. Return False if the run is stopped meanwhile."""
         from daedalus.learner.training.demonstrations import read_demonstrations
         from daedalus.learner.training.replay_learner import ReplayLearner
 
@@ -140,17 +142,24 @@ class LearnerService:
         directory, spec = self._context.directory, self._context.spec
         demonstrations = read_demonstrations(directory, spec, learner.spaces, taken, self._heartbeat.beat)
         if demonstrations is None:
-            return
+            return True
         learner.learn_from(demonstrations)
-        if self._beginning.restored is None and (result := learner.clone(self._heartbeat.beat)):
+        if self._beginning.restored is not None:
+            return True
+        if result := learner.clone(self._goes_on):
             _logger.info("behaviour cloning: %d updates; %s", spec.training.cloning_updates, result)
+        return not self._context.stop.is_set()
 
-    def _stopped_without_actors(self) -> Outcome:
-        _logger.info("stopped before the first actor joined")
+    def _goes_on(self) -> bool:
+        self._heartbeat.beat()
+        return not self._context.stop.is_set()
+
+    def _stopped_early(self, when: str) -> Outcome:
+        _logger.info("stopped %s", when)
         self._server.close(self._why_stopped)
         if self._server.orders.stopped_by:  # else nothing has happened that anybody looks for
             EventFile(self._context.directory).add(self._context.events.take_new())
-        self._server.orders.take_checkpoint()(True, "stopped before the first actor joined: there is nothing to save")
+        self._server.orders.take_checkpoint()(True, f"stopped {when}: there is nothing to save")
         return Outcome(
             solved=False,
             finished=False,
@@ -194,8 +203,11 @@ class LearnerService:
         recorder = Recorder(outputs.writers, outputs.progress, lambda: event_file.add(context.events.take_new()))
         reporter.begin(recorder, time.monotonic())
         finished, ended, saving, saved, lost = False, None, None, False, False
+        from daedalus.learner.training.update_graphs import driver_faults
+
         try:
-            ended = loop.run(reporter)
+            with driver_faults():
+                ended = loop.run(reporter)
             finished = context.is_finished
         except DeviceLostError:
             lost = True

@@ -100,6 +100,7 @@ class TrainingLoop:
         self._context, self._counters, self._health = context, context.counters, context.health
         self._server, self._learner, self._checkpointer = server, learner, checkpointer
         self._orders, self._confirmation, self._beat = server.orders, confirmation, beat
+        self._skipped = learner.updates_skipped  # that are counted
         self._evaluators = EvaluationServer(context, server.evaluations, server.publisher)
 
     def publish(self, program: bytes) -> None:
@@ -130,8 +131,10 @@ class TrainingLoop:
             if self._reaches_target():
                 self._counters.seconds_to_target = self._context.wall_seconds(now)
                 if training.stop_when_solved:
+                    self._settle()
                     return now
             if now >= log_at:
+                self._settle()
                 reporter.record(self._learner, now)
                 log_at = now + service.log_seconds
             due = now >= save_at or self._orders.checkpoint_wanted or self._learner.policy_version > soon_after
@@ -140,6 +143,7 @@ class TrainingLoop:
                 self._checkpointer.begin(on_end=lambda saving, answer=answer: answer(saving.is_saved, saving.result))
                 soon_after = math.inf
                 save_at = now + service.checkpoint_seconds
+        self._settle()
         return time.monotonic()
 
     def _reaches_target(self) -> bool:
@@ -164,10 +168,9 @@ class TrainingLoop:
             self._context.league.advance(learner, env_steps, self._checkpointer.add)
         self._health.left_out = rollouts.left_out
         if not (batch or goes_on):
-            rollouts.count_trained([], learner.finish())  # a GPU is done with the newest batch by now
+            self._settle()  # a GPU is done with the newest batch by now
             return
         began = time.monotonic()
-        skipped = learner.updates_skipped
         left_out = self._learn_from(batch, progress)
         learner.anneal_exploration(self._context.spec.training.exploration_annealing(progress, env_steps))
         if learner.policy_version > version:  # a replay buffer that fills makes no update
@@ -180,14 +183,24 @@ class TrainingLoop:
             )
         self._health.note_update(now)
         self._counters.learning_seconds += now - began
-        skipped = learner.updates_skipped - skipped
+        self._health.gradient_fault = self._count_skipped()
+
+    def _settle(self) -> None:
+        """Wait until a GPU has made the updates of the newest batch, and count what was left out of them."""
+        self._server.rollouts.count_trained([], self._learner.finish())
+        self._health.gradient_fault |= self._count_skipped()
+
+    def _count_skipped(self) -> bool:
+        """Count the updates that were skipped since the last call, and warn of them. Return whether there were any."""
+        skipped = self._learner.updates_skipped - self._skipped
+        self._skipped += skipped
+        self._counters.updates_skipped += skipped
         if skipped and not self._health.gradient_fault:
             _logger.warning(
                 "update skipped: the gradient is not finite; the weights are unchanged. Look for nan in the losses of "
                 "an algorithm of your own, and for very large observations and rewards, or lower training.learning_rate"
             )
-        self._health.gradient_fault = skipped > 0
-        self._counters.updates_skipped += skipped
+        return skipped > 0
 
     def _learn_from(self, uploads: Sequence[Upload], progress: float) -> list[Upload]:
         """Train on one batch. Return rollouts that were left out of it, or of the last one; gradients were checked."""

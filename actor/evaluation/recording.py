@@ -1,5 +1,6 @@
 """Records the episodes of an environment into a dataset, whoever plays: a policy, a bot, a person at the keyboard."""
 
+import copy
 import warnings
 from typing import Any, Protocol
 
@@ -87,14 +88,15 @@ class Recorder(gymnasium.Wrapper):
         if len(self.returns) >= self._wanted:
             raise _EnoughError
         observation, info = self.env.reset(seed=self.seed, options=options)
-        self._observations, self._actions, self._rewards = [observation], [], []
+        self._observations, self._actions, self._rewards = [copy.deepcopy(observation)], [], []
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and write the episode if it ends. Raises DatasetError."""
+        # Environments and players may use the same arrays again.
+        self._actions.append(copy.deepcopy(action))
         result = observation, reward, terminated, truncated, _ = self.env.step(action)
-        self._observations.append(observation)
-        self._actions.append(action)
+        self._observations.append(copy.deepcopy(observation))
         self._rewards.append(float(reward))
         if terminated or truncated:
             episode = Episode(
@@ -150,12 +152,16 @@ class Recorder(gymnasium.Wrapper):
     def _of_space(self, action: Any) -> Any:
         """Return an action as the space has it. Raises EnvironmentSetupError if it is none."""
         space = self.action_space
-        if action is None:
-            action = np.zeros(space.shape or ())
-        action = np.asarray(action, space.dtype)
-        action = action[()] if space.shape == () else action
-        if not space.contains(action):
-            raise EnvironmentSetupError(f"the action {action} of a key, or without one, is outside {space}")
+        given = np.zeros(space.shape or ()).tolist() if action is None else action
+        try:
+            action = np.asarray(given, space.dtype)
+            fits = action.dtype.kind == "f" or bool((action == np.asarray(given)).all())  # 0.5 is no choice
+        except (ValueError, TypeError, OverflowError):
+            fits = False
+        else:
+            action = action[()] if space.shape == () else action
+        if not (fits and space.contains(action)):
+            raise EnvironmentSetupError(f"the action {given} of a key, or without one, is outside {space}")
         return action
 
 

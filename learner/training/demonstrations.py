@@ -1,7 +1,7 @@
 """Demonstrations in the learner: a buffer of their transitions, and behaviour cloning."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -83,10 +83,11 @@ class Cloning:
         kept = max(len(rows) - min(int(_HELD_OUT * len(rows)), _MOST_HELD_OUT), 1)
         self._rows, self._held_out = rows[:kept], rows[kept:]
 
-    def observations(self) -> dict[str, Tensor]:
-        """Return observations of the demonstrations, by component [N, *stacked_shape]: at most 65,536."""
-        step = -(-len(self._rows) // _MOMENTS_ROWS)
-        return self._buffer.transitions(self._rows[::step], 1, 1.0).observations
+    def observations(self) -> Iterator[dict[str, Tensor]]:
+        """Yield observations of the demonstrations, by component [N, *stacked_shape]: at most 65,536 in small parts."""
+        rows = self._rows[:: -(-len(self._rows) // _MOMENTS_ROWS)]
+        for part in _parts(rows):
+            yield self._buffer.transitions(part, 1, 1.0).observations
 
     def gradient(self) -> Tensor:
         """Return the gradient [P] of minus the mean log-probability, over a minibatch drawn at random."""
@@ -98,7 +99,7 @@ class Cloning:
         if not len(self._held_out):
             return np.nan
         with torch.no_grad():
-            parts = [self._log_probs(rows) for rows in np.array_split(self._held_out, -(-len(self._held_out) // 256))]
+            parts = [self._log_probs(rows) for rows in _parts(self._held_out)]
         return float(torch.cat(parts).mean())
 
     def _log_probs(self, rows: np.ndarray) -> Tensor:
@@ -115,3 +116,7 @@ class Cloning:
             for (name, space), part in zip(self._spaces.actions.items(), parts, strict=True)
         }
         return self._network.distribution.log_prob(parameters, actions, {})
+
+
+def _parts(rows: np.ndarray) -> list[np.ndarray]:
+    return np.array_split(rows, -(-len(rows) // _MINIBATCH))

@@ -29,7 +29,7 @@ from daedalus.learner.run.counters import updates_of
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.training.demonstrations import Cloning
 from daedalus.learner.training.optimizers import build_optimizer
-from daedalus.learner.training.update_graphs import UpdateGraphs, check_device, device_faults
+from daedalus.learner.training.update_graphs import UpdateGraphs, check_device, memory_faults
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.learner.training.update_step import UpdateStep
 from daedalus.policy.acting.program import export_program
@@ -241,17 +241,17 @@ class Learner:
           rollouts: the rollouts of the batch, in order.
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
 
-        Raises SettingsError if the GPU has too little memory for the batch, and DeviceLostError if it fails.
+        Raises SettingsError if the GPU has too little memory for the batch.
         """
         count = self.updates_of(rollouts)
         if self._curiosity is not None:
             self._curiosity.look(rollouts, _annealed(self._spec.curiosity, 0.0, progress))
         batch, kept, seen = self._sorted_out(rollouts)
-        with device_faults(batch.rewards.numel(), lambda: self._fitting(batch)):
+        with memory_faults(batch.rewards.numel(), lambda: self._fitting(batch)):
             on_device = self.graphs.moved(batch)
             left_out = self.finish()
-            made = self._make_updates(on_device, progress, count)
             self.policy_version += count
+            made = self._make_updates(on_device, progress, count)
             self._pending = _Pending(batch, kept, seen, progress, count, made)
             return left_out if self.overlaps else left_out + self.finish()
 
@@ -277,7 +277,7 @@ class Learner:
         pending, self._pending = self._pending, None
         if pending is None:
             return []
-        with device_faults(pending.batch.rewards.numel(), lambda: self._fitting(pending.batch)):
+        with memory_faults(pending.batch.rewards.numel(), lambda: self._fitting(pending.batch)):
             return self._finished(pending)
 
     def _finished(self, pending: _Pending) -> list[Rollout]:
@@ -356,7 +356,7 @@ class Learner:
         self._observations.merge(parts, self._ranges)
 
     def _make_updates(self, batch: Batch, progress: float, count: int) -> "_Made | None":
-        """Make the updates that bring the policy to the version after the batch, until a gradient is not finite."""
+        """Make the last `count` updates up to the present version, until a gradient is not finite."""
         self.first_pass = None  # its memory is used for this batch
         self._step.begin(self.learning_rate(progress))
         self._bonus.fill_(self.entropy_bonus(progress))
@@ -376,7 +376,7 @@ class Learner:
             if not self.graphs.records:
                 if self._step.has_failed:
                     return None
-                self._gradients.after_update(self.policy_version + number)
+                self._gradients.after_update(self.policy_version - count + number)
             if number == count:
                 break
         first_pass = self._gradients.take_first_pass()
@@ -389,19 +389,23 @@ class Learner:
         forward = self._gradients.forward
         self._cloning = Cloning(self._network, self._flat, forward, self.spaces, demonstrations)
 
-    def clone(self, beat: Callable[[], None] = lambda: None) -> str:
+    def clone(self, goes_on: Callable[[], bool] = lambda: True) -> str:
         """Let the policy imitate the demonstrations before the first update, and return how well it does, in words.
 
-        `beat` is called before each update. Return an empty string where there is nothing to imitate.
+        `goes_on` is called before each update, and ends the imitation with False. Return an empty string then, and
+        where there is nothing to imitate.
         """
         cloning, updates = self._cloning, self._spec.cloning_updates
         if cloning is None or not updates:
             return ""
-        self._observations.add(cloning.observations())
+        if self._observations.moments:
+            for observations in cloning.observations():
+                self._observations.add(observations)
         before, optimizer = cloning.held_out(), build_optimizer(self._spec, self._flat.values)
         rate = self._flat.values.new_tensor(self.learning_rate(0.0))
         for _ in range(updates):
-            beat()
+            if not goes_on():
+                return ""
             self._flat.gradients.copy_(cloning.gradient())
             norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
             optimizer.step(self._flat.values, self._flat.gradients, rate, (~norm.isfinite()).to(rate.dtype))

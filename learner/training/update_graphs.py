@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import traceback
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
@@ -36,8 +37,8 @@ def check_device(precision: str) -> None:
 
 
 @contextlib.contextmanager
-def device_faults(rows: int, fitting: Callable[[], int]) -> Iterator[None]:
-    """Raise SettingsError if a GPU lacks memory in the block, and DeviceLostError if it fails.
+def memory_faults(rows: int, fitting: Callable[[], int]) -> Iterator[None]:
+    """Raise SettingsError if a GPU lacks memory in the block.
 
     Args:
       rows: of the batch.
@@ -45,7 +46,8 @@ def device_faults(rows: int, fitting: Callable[[], int]) -> Iterator[None]:
     """
     try:
         yield
-    except torch.OutOfMemoryError:
+    except torch.OutOfMemoryError as error:
+        traceback.clear_frames(error.__traceback__)  # they hold the tensors of the attempt
         fit = fitting()
         remedy = (
             f"{fit:,} rows fit: set training.batch_rollouts, or more training.minibatches, accordingly"
@@ -55,6 +57,13 @@ def device_faults(rows: int, fitting: Callable[[], int]) -> Iterator[None]:
         raise SettingsError(
             f"the updates of a batch of {rows:,} rows do not fit into the memory of the GPU; {remedy}"
         ) from None
+
+
+@contextlib.contextmanager
+def driver_faults() -> Iterator[None]:
+    """Raise DeviceLostError if a GPU fails in the block: any operation that waits for it may be the first to notice."""
+    try:
+        yield
     except RuntimeError as error:
         if not _is_of_driver(error):
             raise
@@ -164,12 +173,11 @@ class UpdateGraphs:
             # Other threads may use the device meanwhile: a snapshot may be on its way.
             with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 result = function(inputs, number)
-        except torch.OutOfMemoryError:
-            raise
-        except RuntimeError as error:
+        except RuntimeError as error:  # also for want of memory: the updates alone fit, as they did before
             self.is_enabled = False
             _logger.warning("updates are launched one by one, and take longer: %s", first_line(error))
             torch.cuda.synchronize(self._device)
+            self.forget()
             return False
         finally:
             self.records = False

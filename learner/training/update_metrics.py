@@ -48,7 +48,7 @@ class UpdateMetrics:
     def add_batch_metrics(self, metrics: Tensor) -> None:
         """Add BATCH_METRICS of a batch, or of the rollout of a gradient; nan for a metric that it does not have."""
         known = ~metrics.isnan()
-        self._batch_sums += metrics.nan_to_num(0.0)
+        self._batch_sums += metrics.nan_to_num(0.0, math.inf, -math.inf)
         self._batches += known
 
     def add_batch(self, batch: Batch) -> None:

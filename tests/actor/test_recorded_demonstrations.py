@@ -2,11 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import minari
 import numpy as np
 import pytest
 
+from daedalus.actor.environments.minari_files import MinariWriter
+from daedalus.actor.evaluation.recording import Recorder
 from daedalus.cli.commands.record import record
 
 PUMP = """
@@ -46,6 +50,38 @@ def test_a_bot_is_recorded_with_every_observation(recorded: Callable[..., int], 
     assert dataset.total_episodes == 2
 
 
+class OneArray(gymnasium.Env):
+    """Counts its steps, in the same array each time."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 9.0, (1,))
+    action_space = gymnasium.spaces.Discrete(2)
+    count = np.zeros(1, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.count[:] = 0.0
+        return self.count, {}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1.0
+        return self.count, 0.0, bool(self.count[0] == 3.0), False, {}
+
+
+class Always:
+    def reset(self, seed: int) -> None:
+        pass
+
+    def act(self, observation: Any, action_mask: Any) -> Any:
+        return 1
+
+
+def test_an_environment_may_use_its_array_again(tmp_path: Path) -> None:
+    environment = OneArray()
+    writer = MinariWriter(str(tmp_path / "shown"), environment.observation_space, environment.action_space)
+    Recorder(environment, writer, episodes=1, seed=0).play(Always())
+    (episode,) = minari.MinariDataset(tmp_path / "shown/data")
+    assert episode.observations.ravel().tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
 def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) -> None:
     keys = ("--key", "a=0", "--key", "d=1", "--idle", "1", "--rate", "500")
     assert recorded("--env", "CartPole-v1", "--by", "keys", *keys, "--episodes", 2) == 0
@@ -60,6 +96,8 @@ def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) 
     [
         (("--env", "CartPole-v1"), 2, "name either a run directory, or --env ID and --by PLAYER"),
         (("--env", "CartPole-v1", "--by", "keys", "--key", "a=7"), 1, "the action 7 of a key"),
+        (("--env", "CartPole-v1", "--by", "keys", "--key", "a=0.5"), 1, "the action 0.5 of a key"),
+        (("--env", "CartPole-v1", "--by", "keys", "--key", 'a=["x"]'), 1, "the action ['x'] of a key"),
         (("--env", "CartPole-v1", "--by", "keys", "--key", "a"), 2, "write K=ACTION"),
         (("--env", "CartPole-v1", "--by", "keys"), 1, "name keys with --key"),
         (("--env", "CartPole-v1", "--by", "pumping:Nobody"), 1, "Nobody"),

@@ -17,6 +17,7 @@ from building import (
     run_context,
 )
 
+from daedalus.algorithms.action_values import ActionValues
 from daedalus.learner.serving.fleet import NON_FINITE, Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.learner.training.learner import Learner
@@ -74,6 +75,15 @@ def test_update_equals_that_of_a_batch_without_the_rollouts_left_out(policy: Pol
         np.testing.assert_array_equal(array, learners[1].weights()[name])
     for name, value in learners[0].state().items():
         assert torch.equal(value, learners[1].state()[name])
+
+
+def test_a_repeated_update_has_its_own_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions: list[int] = []
+    monkeypatch.setattr(ActionValues, "after_update", lambda _self, version, _forward: versions.append(version))
+    learner = Learner(TrainingSpec(algorithm="one_step_q"), POLICY, SPACES)
+    for _ in range(3):
+        learner.step([rollout("a"), rollout("b", **HUGE_REWARDS)], 0.0)
+    assert versions == [1, 2, 3]
 
 
 @pytest.mark.parametrize(("algorithm", "updates"), [("a2c", 1), ("appo", 12)])

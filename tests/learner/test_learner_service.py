@@ -223,6 +223,24 @@ def test_every_algorithm_trains_with_frame_stacks_and_recurrent_policy(tmp_path:
     assert "malformed" not in summary["rollouts_rejected"]
 
 
+def test_what_is_known_of_a_batch_late_is_in_the_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = Learner.step
+
+    def late(learner: Learner, rollouts: Sequence[Rollout], progress: float) -> Any:
+        learner.overlaps = True  # as on a GPU
+        return step(learner, rollouts, progress)
+
+    monkeypatch.setattr(Learner, "step", late)
+    training_run = TrainingRun(tmp_path)
+    try:
+        until(lambda: len(training_run.rows()) > 3)
+    finally:
+        training_run.end()
+    rows = [row for row in training_run.rows() if row["policy_loss"]]
+    assert rows
+    assert all(row["value_error_p50"] and row["explained_variance"] for row in rows)
+
+
 def test_sender_of_rollouts_without_a_finite_gradient_is_quarantined_and_training_continues(tmp_path: Path) -> None:
     training_run = TrainingRun(
         tmp_path,

@@ -1,5 +1,6 @@
 """The updates of a batch as a GPU makes them, without one: no value is read, results come late, and it may fail."""
 
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.learner.run.settings import DeviceLostError, SettingsError
 from daedalus.learner.training.learner import Learner
+from daedalus.learner.training.update_graphs import driver_faults, memory_faults
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.learner.training.update_step import UpdateStep
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -116,14 +118,27 @@ def test_too_little_memory_is_reported_with_the_number_of_rows_that_fit(monkeypa
         learner.step([make_rollout(environments=4)], 0.0)
 
 
-def test_a_device_that_fails_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(*_: Any) -> Iterator[Any]:
-        raise RuntimeError("CUDA error: unspecified launch failure\nCompile with ...")
+def test_what_a_failed_attempt_held_is_released_before_the_fitting_rows_are_sought() -> None:
+    class Held:
+        pass
 
-    monkeypatch.setattr(GradientComputer, "compute", failing)
-    learner = Learner(TrainingSpec(algorithm="impala"), PolicySpec(hidden=(8,)), SPACES)
-    with pytest.raises(DeviceLostError, match=r"^the GPU has failed: .*unspecified launch failure.* resume the run$"):
-        learner.step([make_rollout()], 0.0)
+    held: list[weakref.ref[Held]] = []
+
+    def attempt() -> None:
+        tensors = Held()
+        held.append(weakref.ref(tensors))
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    with pytest.raises(SettingsError, match="; 4 rows fit"), memory_faults(8, lambda: 4 if held[0]() is None else 0):
+        attempt()
+
+
+def test_a_device_that_fails_is_reported_in_one_line() -> None:
+    with (
+        pytest.raises(DeviceLostError, match=r"^the GPU has failed: .*unspecified launch failure.* resume the run$"),
+        driver_faults(),
+    ):
+        raise RuntimeError("CUDA error: unspecified launch failure\nCompile with ...")
 
 
 def test_a_card_without_bfloat16_is_refused_if_the_run_asks_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
