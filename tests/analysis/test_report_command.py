@@ -420,7 +420,9 @@ def test_the_evaluation_of_one_episode_has_no_interval(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["env_steps", "wall_seconds"])
-def test_numbers_of_a_hostile_run_that_cannot_be_drawn_are_left_out(folder: Path, name: str) -> None:
+def test_numbers_of_a_hostile_run_that_cannot_be_drawn_are_refused_or_left_out(
+    folder: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = record(folder / "run")
     for values in (["-1e308", "1e308", "1e308"], ["", "", ""]):
         rows = list(csv.DictReader((run / "metrics.csv").read_text().splitlines()))
@@ -431,8 +433,12 @@ def test_numbers_of_a_hostile_run_that_cannot_be_drawn_are_left_out(folder: Path
             writer.writeheader()
             writer.writerows(changed)
         for by in ("env_steps", "minutes"):
-            assert report(["run", "--by", by]) == 0
-            assert not re.search(r'd="[^"]*(nan|inf)', (run / "report.html").read_text())
+            if name == "env_steps":  # without which nothing has a place
+                assert report(["run", "--by", by]) == 1
+                assert "env_steps has a value that is no number of steps" in capsys.readouterr().err
+            else:
+                assert report(["run", "--by", by]) == 0
+                assert not re.search(r'd="[^"]*(nan|inf)', (run / "report.html").read_text())
 
 
 @pytest.mark.parametrize(
