@@ -168,7 +168,7 @@ class NewRun:
             other_spaces=self.other_spaces,
         )
         if self.demonstrations is not None:
-            from daedalus.launch.demonstrations import write_demonstrations  # what other runs need not import
+            from daedalus.launch.dataset_import import write_demonstrations  # what other runs need not import
 
             try:
                 write_demonstrations(self.demonstrations, spec, spaces, lock.directory)

@@ -115,7 +115,7 @@ class ClientRows:
         """Note an observation to act on, which the last action, or the last episode's end, led to.
 
         Adds `reward`, if there is one, to the reward of the last action. Raises ValueError if the observation, the mask
-        or the reward does not fit, or an episode begins whose parameters nobody has asked for; nothing has changed
+        or the reward does not fit, or if an episode begins and its parameters were not asked for; nothing has changed
         then.
         """
         if self.draws is not None and self._drawn is None and not self.in_episode:

@@ -30,7 +30,7 @@ class LessonDraws:
         return drawn
 
     def with_lessons(self, parameters: Parameters) -> Parameters:
-        """Return those of an episode's parameters that have a lesson: the learner is told with which it was played."""
+        """Return those of an episode's parameters that have a lesson; rollouts tell the learner of these alone."""
         return {name: parameters[name] for name in self._names}
 
     def _one(self, true_value: int | float, ranges: tuple[LessonRange, ...]) -> int | float:

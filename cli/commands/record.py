@@ -129,14 +129,14 @@ def _json(text: str, where: str) -> Any:
 
 def _record(parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any) -> int:
     from daedalus.actor.environments.minari_files import MinariWriter
-    from daedalus.actor.evaluation.loaded_policy import load_policy
-    from daedalus.actor.evaluation.recording import (
+    from daedalus.actor.evaluation.dataset_recorder import (
         BotPlayer,
         PolicyPlayer,
         Recorder,
         recorded_environment,
         spec_to_record,
     )
+    from daedalus.actor.evaluation.loaded_policy import load_policy
 
     by_keys, player = parsed.by == _KEYS, None
     if parsed.directory is not None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daedalus.actor.environments.minari_files import MinariWriter
-from daedalus.actor.evaluation.recording import Recorder
+from daedalus.actor.evaluation.dataset_recorder import Recorder
 from daedalus.cli.commands.record import record
 
 PUMP = """

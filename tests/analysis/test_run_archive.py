@@ -17,10 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recorded_runs import record
 from saved_runs import CARTPOLE, save
+from test_run_folder import said
 
 import daedalus
 from daedalus.analysis.run_archive import ArchiveError, read_archive
-from daedalus.cli.commands.runs import runs
 from daedalus.learner.run.run_directory import create
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.policy.saving.sealed import write_sealed
@@ -31,14 +31,6 @@ from daedalus.protocol.spec import RunSpec
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def said(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> str:
-    assert runs([*words]) == status
-    out, err = capsys.readouterr()
-    if status:
-        assert err.count("\n") == 1, err
-    return err if status else out
 
 
 def contents(directory: Path) -> dict[str, tuple[bytes, int]]:

@@ -17,8 +17,8 @@ from minari.data_collector import EpisodeBuffer
 
 from daedalus.actor.environments.minari_files import Episode, MinariReader, MinariWriter
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.launch import demonstrations
-from daedalus.launch.demonstrations import write_demonstrations
+from daedalus.launch import dataset_import
+from daedalus.launch.dataset_import import write_demonstrations
 from daedalus.learner.run import demonstration_files
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.demonstrations import read_demonstrations
@@ -109,7 +109,7 @@ def expected(frames: int) -> list[tuple[list[float], list[float], list[float], f
 def test_transitions_are_those_of_the_recorded_episodes(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frames: int, part_bytes: int
 ) -> None:
-    for module in (demonstrations, demonstration_files):
+    for module in (dataset_import, demonstration_files):
         monkeypatch.setattr(module, "PART_BYTES", part_bytes)  # also the length of rollouts
     monkeypatch.setattr(demonstration_files, "MOST_ROWS", 4)
     write_demonstrations("arm/shown-v0", spec_of(frames), spaces_of(frames), tmp_path)
