@@ -38,15 +38,16 @@ from daedalus import Client
 RATE = 50.0  # ticks a second
 EPISODE = 100  # ticks: two seconds
 PATIENCE = 50  # ticks before somebody helps
-HALF_WIDTH, DEPTH = 0.03, 0.08  # of the hole, in metres
+HALF_WIDTH, DEPTH = 0.02, 0.08  # of the hole, in metres
 SPEED = 0.5  # metres a second
 REWARD = 100.0  # of success
-SIDE = 48  # pixels of a picture
+SIDE, HIGH = 48, 38  # pixels of a picture, and those above the plate
+PIXEL = 0.0125  # metres
 CUT_SECONDS = 30.0  # between cuts of the network
 
 
 class Arm(gymnasium.Env):
-    """An arm that moves a peg above a plate with a hole, at commanded speeds. The peg slides on the plate."""
+    """An arm that moves a peg above a plate with a hole, at commanded speeds, and stops where it hits the plate."""
 
     observation_space: gymnasium.Space = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -54,8 +55,8 @@ class Arm(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Lift the peg; the hole is somewhere else."""
         super().reset(seed=seed)
-        self.hole = self.np_random.uniform(-0.3, 0.3)
-        self.peg = np.array([self.np_random.uniform(-0.3, 0.3), 0.35])  # its tip, to the right and up from the plate
+        self.hole = self.np_random.uniform(-0.2, 0.2)
+        self.peg = np.array([self.np_random.uniform(-0.2, 0.2), 0.35])  # its tip, to the right and above the plate
         self.speeds, self.ticks = np.zeros(2), 0
         return self.look(), {}
 
@@ -64,17 +65,17 @@ class Arm(gymnasium.Env):
         return np.array([self.peg[0] - self.hole, self.peg[1], *self.speeds], np.float32)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Move for one tick. The episode ends when the peg is in the hole, or after two seconds."""
+        """Move for one tick. The episode ends when the peg is in the hole or hits the plate, or after two seconds."""
         self.ticks += 1
         self.speeds += 0.5 * (SPEED * np.clip(action, -1.0, 1.0) - self.speeds)
         inside = self.peg[1] < 0.0
-        self.peg = np.clip(self.peg + self.speeds / RATE, [-0.45, -DEPTH], [0.45, 0.4])
+        self.peg = np.clip(self.peg + self.speeds / RATE, [-0.28, -DEPTH], [0.28, 0.4])
         if inside:
             self.peg[0] = np.clip(self.peg[0], self.hole - HALF_WIDTH, self.hole + HALF_WIDTH)
-        elif abs(self.peg[0] - self.hole) > HALF_WIDTH:
-            self.peg[1] = max(self.peg[1], 0.0)
         success = bool(self.peg[1] <= -DEPTH)
-        return self.look(), REWARD * success, success, self.ticks >= EPISODE and not success, {}
+        hits = self.peg[1] < 0.0 and bool(abs(self.peg[0] - self.hole) > HALF_WIDTH)
+        over = success or hits
+        return self.look(), REWARD * success, over, self.ticks >= EPISODE and not over, {}
 
 
 class Camera(Arm):
@@ -83,11 +84,11 @@ class Camera(Arm):
     observation_space = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 1), np.uint8)
 
     def look(self) -> np.ndarray:
-        """Return the picture. A pixel is 2 cm wide and 1.25 cm high; the top of the plate is at row 38."""
+        """Return the picture."""
         pixels = np.arange(SIDE)
-        row, column, hole = 38 - self.peg[1] / 0.0125, SIDE / 2 + self.peg[0] / 0.02, SIDE / 2 + self.hole / 0.02
+        row, column, hole = HIGH - self.peg[1] / PIXEL, SIDE / 2 + self.peg[0] / PIXEL, SIDE / 2 + self.hole / PIXEL
         peg = np.outer(_covered(pixels, row - 4.0, 4.0), _covered(pixels, column, 1.0))
-        plate = np.outer(pixels >= 38, 1.0 - _covered(pixels, hole, 1.5))
+        plate = np.outer(pixels >= HIGH, 1.0 - _covered(pixels, hole, HALF_WIDTH / PIXEL))
         return np.maximum(255.0 * peg, 96.0 * plate).astype(np.uint8)[..., None]
 
 
@@ -113,8 +114,8 @@ class Person:
         else:
             white, grey = observation[..., 0] > 96, observation[-1, :, 0]
             rows, columns = np.nonzero(white)
-            aside = 0.02 * (columns.mean() - np.average(np.arange(SIDE), weights=96.5 - np.minimum(grey, 96)))
-            height = 0.0125 * (38 - rows.max())
+            aside = PIXEL * (columns.mean() - np.average(np.arange(SIDE), weights=96 - np.minimum(grey, 96)))
+            height = PIXEL * (HIGH - rows.max())
         over = abs(aside) < HALF_WIDTH / 2 or height < 0.0
         wanted = np.array([-10.0 * aside, -1.0 if over else 5.0 * (0.1 - height)])
         return np.clip(wanted + self._random.normal(0.0, 0.1, 2), -1.0, 1.0).astype(np.float32)
@@ -142,13 +143,13 @@ def drive(address: str, options: argparse.Namespace, results: Connection) -> Non
         while clock.wait() and clock.deadlines < last:
             helps = watched and arm.ticks >= PATIENCE
             action = client.act(observation, override=person.act(observation) if helps else None)
-            observation, _, success, is_late, _ = arm.step(action)
-            if not (success or is_late):
+            observation, reward, is_over, is_late, _ = arm.step(action)
+            if not (is_over or is_late):
                 continue
-            if success:
+            if success := reward > 0.0:
                 client.success(REWARD, observation)
             else:
-                client.end_episode(terminated=False, observation=observation)
+                client.end_episode(terminated=is_over, observation=observation)
             episodes, helped = episodes + 1, helped + helps
             if not helps:
                 alone.append(success)
