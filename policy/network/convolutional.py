@@ -106,13 +106,13 @@ def _shifted(images: Tensor) -> Tensor:
     """
     count, _, height, width = images.shape
     most = -(-4 * min(height, width) // 84)
-    by = torch.randint(-most, most + 1, (2, count, 1)).to(images.device)
-    rows, columns = (
-        (torch.arange(side, device=images.device) + shift).clamp_(0, side - 1)  # [N, side]
-        for side, shift in zip((height, width), by, strict=True)
-    )
-    which = torch.arange(count, device=images.device)[:, None, None]
-    return images.permute(0, 2, 3, 1)[which, rows[:, :, None], columns[:, None]].permute(0, 3, 1, 2)
+    down, right = torch.randint(-most, most + 1, (2, count, 1)).to(images.device)
+    rows = (torch.arange(height, device=images.device) + down).clamp_(0, height - 1)  # [N, H]
+    columns = (torch.arange(width, device=images.device) + right).clamp_(0, width - 1)
+    rows += height * torch.arange(count, device=images.device)[:, None]
+    pixels = images.permute(0, 2, 3, 1).flatten(0, 2)  # [N * H * W, C]
+    shifted = pixels.index_select(0, (width * rows[:, :, None] + columns[:, None]).flatten())
+    return shifted.view(count, height, width, -1).permute(0, 3, 1, 2)
 
 
 def nature(space: ArraySpace) -> ImageEncoder:
