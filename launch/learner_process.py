@@ -178,7 +178,7 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     modules.check(spec.learner_modules)  # the learner makes no environment
     spec = with_record(spec, modules)
     if options.prepared is None:  # else the program that prepared the run has said it
-        warn_of_unread(new.choice.assignments, new.choice.settings, spec)
+        warn_of_unread(new.choice.names(), spec)
     exists = (directory / run_directory.CONFIG).exists()
     return ChosenRun(spec=spec, directory=options.here / directory, exists=exists, changed=changed, modules=modules)
 
