@@ -25,11 +25,6 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 
 
-import os
-
-SHIFTS = os.environ.get("SHIFTS", "1") == "1"
-
-
 class TwinCritics(nn.Module):
     """Two critics Q_1(s, a) and Q_2(s, a) with layers of their own, computed at once, and one encoder of images.
 
@@ -52,7 +47,7 @@ class TwinCritics(nn.Module):
     def convolve(self, prepared: Components) -> Components:
         """Return observations, with each image shifted at random and replaced by the outputs of its convolutions."""
         encoders = image_encoders(self.encoder)
-        return prepared | {name: encoder.convolve(prepared[name], shifted=SHIFTS) for name, encoder in encoders.items()}
+        return prepared | {name: encoder.convolve(prepared[name], shifted=True) for name, encoder in encoders.items()}
 
     def forward(self, prepared: Components, actions: Tensor) -> Tensor:
         """Return both values [2, B] of actions [B, D] in observations, each [B, *stacked_shape] or convolved."""
