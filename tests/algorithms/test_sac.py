@@ -215,8 +215,8 @@ def test_convolutions_are_those_of_the_critics() -> None:
         return all(torch.equal(one, other) for one, other in zip(ours.parameters(), theirs.parameters(), strict=True))
 
     assert same(), "the critics begin with those of the policy, which may come from another run"
-    images = [torch.randint(0, 255, (4, 2, 42, 42), dtype=torch.uint8) for _ in range(2)]
-    batch = Transitions(*({"pixels": each} for each in images), torch.zeros(4, 1), torch.ones(4), torch.ones(4))
+    now, then = ({"pixels": torch.randint(0, 255, (4, 2, 42, 42), dtype=torch.uint8)} for _ in range(2))
+    batch = Transitions(now, then, torch.zeros(4, 1), torch.ones(4), torch.ones(4))
     network.policy_head.weight.data.normal_()
     gradients, _ = sac.gradients(batch)
     learned = {name: each.numel() for name, each in network.named_parameters() if each.requires_grad}
