@@ -19,7 +19,7 @@ _MOST_OBSERVATIONS = 2_000_000  # of all running episodes together, about 200 MB
 _SIZE = 8  # of the set of an episode itself, in observations
 _JUDGED_ROWS = 4096  # the first ones
 _LARGEST = 10.0  # reward at a weight of 1, as that of normalised rewards
-_MOST_NEW = 0.95  # share of first visits, above which observations do not come back
+_MOST_NEW = 0.95  # share of first visits, above which observations do not come back, and nothing is rewarded
 
 _logger = logging.getLogger(__name__)
 
@@ -86,7 +86,8 @@ class Curiosity:
     with a weight w, and d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for
     the rewards of the environment (RewardNormalizer). Where each episode has another map, this term alone explores as
     well as together with the prediction errors that it was added to at first: Wang et al. (2023), "Revisiting Intrinsic
-    Reward for Exploration in Procedurally Generated Environments".
+    Reward for Exploration in Procedurally Generated Environments". Where nearly every observation is new, the term
+    would reward long episodes alone: after the first rows it is 0 for good.
     """
 
     def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:
@@ -96,6 +97,7 @@ class Curiosity:
         self._newest: dict[Rollout, np.ndarray] = {}  # first visits of the newest batch
         self._factor = 0.0  # of the newest batch
         self._rows = self._new = 0  # among the first rows; it has judged them if there are enough
+        self._rewards = True
 
     @property
     def statistics(self) -> dict[str, Tensor]:
@@ -107,9 +109,9 @@ class Curiosity:
         self._newest = {each: self._visits.add(each) for each in rollouts}
         counted = [replace(each, rewards=first) for each, first in self._newest.items()]
         self._scale.moments.merge(self._scale.moments_of(counted))
-        self._factor = weight * min(1.0 / self._scale.divisor, _LARGEST)
         if self._rows < _JUDGED_ROWS:
             self._judge()
+        self._factor = weight * min(1.0 / self._scale.divisor, _LARGEST) if self._rewards else 0.0
 
     def add_to(self, batch: Batch, rollouts: Sequence[Rollout]) -> None:
         """Add the rewards of rollouts to those of their batch in place. Rollouts not looked at have none."""
@@ -128,13 +130,14 @@ class Curiosity:
         return dict(zip(METRICS, (share, share * self._factor), strict=True))
 
     def _judge(self) -> None:
-        """Warn once, after enough rows, if observations do not come back."""
+        """Stop rewarding, after enough rows, if observations do not come back."""
         self._rows += sum(int(each.learned.sum()) for each in self._newest)
         self._new += sum(int(first[each.learned].sum()) for each, first in self._newest.items())
         if self._rows >= _JUDGED_ROWS and self._new > _MOST_NEW * self._rows:
+            self._rewards = False
             _logger.warning(
-                "training.curiosity hardly tells rows apart: %.0f %% of them lead to an observation that is new in its "
-                "episode, so that it rewards little but long episodes. Set training.curiosity=0, or let "
-                "environment.wrap round the observations or leave out what always changes, such as a clock",
+                "training.curiosity stops: %.0f %% of the rows lead to an observation that is new in its episode, so "
+                "that it would reward little but long episodes. To keep it, let environment.wrap round the "
+                "observations or leave out what always changes, such as a clock",
                 100.0 * self._new / self._rows,
             )

@@ -47,6 +47,8 @@ def default_settings(
     for section, values in settings.pop("for_two_seats", {}).items():
         if seats == _FULL_SEATS:
             settings[section] |= values
+    if seats > 1:
+        settings["with_memory"]["training"].pop("curiosity", None)  # was not measured in games
     if seats > _FULL_SEATS:
         for collection in (settings["collection"], settings["with_memory"]["collection"]):
             collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)

@@ -117,20 +117,24 @@ def test_run_may_become_curious_at_a_resume() -> None:
     plain.restore(4, curious.weights(), curious.state())
 
 
-def test_warning_says_once_that_observations_do_not_come_back(
+def test_curiosity_stops_and_says_so_where_observations_do_not_come_back(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(curiosity, "_JUDGED_ROWS", 50)  # as few as there are here
-    learner = Learner(TrainingSpec(curiosity=1.0), POLICY, SPACES)
+    learner = Learner(TrainingSpec(algorithm="appo", curiosity=1.0), POLICY, SPACES)
     for batch in walk(1, 8):
         learner.step(batch, 0.0)
     assert not caplog.records
-    learner = Learner(TrainingSpec(curiosity=1.0), POLICY, SPACES)
+    assert learner.take_diagnostics()["curiosity_reward_mean"] > 0.0
+    learner = Learner(TrainingSpec(algorithm="appo", curiosity=1.0), POLICY, SPACES)
+    rewarded = []
     for number in range(8):
         learner.step([make_rollout(identity(sequence=number), seed=number)], 0.0)
-    assert [record.getMessage()[:47] for record in caplog.records] == [
-        "training.curiosity hardly tells rows apart: 100"
-    ]
+        rewarded.append(learner.take_diagnostics()["curiosity_reward_mean"] > 0.0)
+    assert rewarded[0]
+    assert rewarded == sorted(rewarded, reverse=True)
+    assert not rewarded[-1]
+    assert [record.getMessage()[:34] for record in caplog.records] == ["training.curiosity stops: 100 % of"]
 
 
 def test_curiosity_refuses_gradients_of_actors() -> None:
