@@ -221,9 +221,6 @@ class PolicySpec(Specification):
     """Recurrent layer between the encoder and the heads."""
     memory_units: Annotated[int, Field(ge=1, le=4096)] = 256
     """Size of the recurrent state."""
-    memory_bypass: bool = False
-    """Let the heads read the features of an observation beside the recurrent state, whose units begin with memories of
-    1 to 150 rows, in place of 1 row. A default of `--env ID` for observations without images and discrete actions."""
 
     @property
     def user_modules(self) -> dict[str, str]:

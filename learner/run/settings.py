@@ -310,7 +310,7 @@ def unread_settings(spec: RunSpec) -> set[str]:
         "training.cloning_updates training.cloning_weight": record.demonstrations and not record.replay,
         "training.rmsprop_decay": training.optimizer == "rmsprop",
         "policy.separate_value_encoder": has_returns and policy.memory == "none",
-        "policy.memory_units policy.memory_bypass": policy.memory != "none",
+        "policy.memory_units": policy.memory != "none",
         "policy.mixture_components": policy.distribution == "gaussian_mixture",
     }
     return {name for names, is_read in unread.items() if not is_read for name in names.split()}

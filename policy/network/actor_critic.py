@@ -47,8 +47,7 @@ class ActorCritic(nn.Module):
         self.codes = build_codes(spec, spaces.observations)
         self.encoder = build_encoder(spec, spaces.observations, modules)
         features = self.encoder.features
-        has_memory = spec.memory == "gru"
-        self.memory = Gru(features, spec.memory_units, bypass=spec.memory_bypass) if has_memory else NoMemory(features)
+        self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)
         self.policy_head = orthogonal(nn.Linear(self.memory.features, self.distribution.parameter_count), _POLICY_GAIN)
         has_values = training is None or training.record.heads == "policy_and_value"
         self.value_head = orthogonal(nn.Linear(self.memory.features, 1)) if has_values else None

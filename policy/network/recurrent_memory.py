@@ -5,8 +5,6 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-_SLOWEST = 5.0  # bias of the update gate of the slowest unit
-
 
 class Memory(Protocol):
     """Module that maps the features of a row and the state before it to the inputs of the heads and the next state."""
@@ -60,35 +58,21 @@ class Gru(nn.Module):
     also under autocast: rounding must not add up over the rows.
     """
 
-    def __init__(self, features: int, units: int, *, bypass: bool = False) -> None:
-        """Construct the unit.
-
-        Args:
-          features: inputs of a row.
-          units: size of the state.
-          bypass: the inputs of the heads are x beside h', and the units forget at different speeds at the start: b_hz
-            rises from 0 to 5, so that a unit keeps e^-1 of its state for 1 / -ln(sigmoid(b_hz)) rows, 1.4 to 149, as
-            Tallec & Ollivier (2018), "Can recurrent neural networks warp time?", propose for known spans. With b_hz = 0
-            and without x, 20 rows leave a millionth; slow units alone would hardly show what is observed now.
-        """
+    def __init__(self, features: int, units: int) -> None:
         super().__init__()
         self.state_size = units
-        self.features = units + features if bypass else units
-        self._has_bypass = bypass
+        self.features = units
         self.input = nn.Linear(features, 3 * units)
         self.hidden = nn.Linear(units, 3 * units)
         for layer in (self.input, self.hidden):
             for gate in layer.weight.chunk(3):
                 nn.init.orthogonal_(gate)
             nn.init.zeros_(layer.bias)
-        if bypass:
-            with torch.no_grad():
-                self.hidden.bias[units : 2 * units] = torch.linspace(0.0, _SLOWEST, units)
 
     def step(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """See Memory."""
         state = self._next(self.input(features), state)
-        return self._shown(features, state), state
+        return state, state
 
     def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
         """See Memory."""
@@ -96,11 +80,7 @@ class Gru(nn.Module):
         for inputs, start in zip(self.input(features), starts.unsqueeze(-1), strict=True):
             state = self._next(inputs, state.masked_fill(start, 0.0))
             states.append(state)
-        return self._shown(features, torch.stack(states))
-
-    def _shown(self, features: Tensor, states: Tensor) -> Tensor:
-        """Return the inputs of the heads: features [..., F], states [..., S] -> [..., F']."""
-        return torch.cat([states, features.to(states.dtype)], -1) if self._has_bypass else states
+        return torch.stack(states)
 
     def _next(self, inputs: Tensor, state: Tensor) -> Tensor:
         """Return the next state: projected inputs [N, 3S], state [N, S] -> [N, S]."""

@@ -114,26 +114,6 @@ def test_gru_matches_torch() -> None:
         torch.testing.assert_close(ours.step(features, state)[0], theirs(features, state), atol=1e-6, rtol=1e-5)
 
 
-def test_bypass_shows_the_heads_the_features_beside_states_that_fade_at_different_speeds() -> None:
-    """With weights of zero and no candidate, h' = sigmoid(b_hz) h, whatever else happens: the oracle's own powers."""
-    memory, rows = Gru(3, 6, bypass=True), 40
-    features, state = torch.randn(rows, 2, 3), torch.rand(2, 6)
-    with torch.no_grad():
-        for layer in (memory.input, memory.hidden):
-            layer.weight.zero_()
-        shown = memory.unroll(features, state, torch.zeros(rows, 2, dtype=torch.bool))
-        alone, row = [], state
-        for each in features:
-            inputs, row = memory.step(each, row)
-            alone.append(inputs)
-    assert shown.shape == (rows, 2, memory.features)
-    torch.testing.assert_close(shown, torch.stack(alone))
-    torch.testing.assert_close(shown[..., 6:], features)
-    kept = [1.0 / (1.0 + np.exp(-bias)) for bias in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
-    faded = np.array([[k ** (row + 1) for k in kept] for row in range(rows)])[:, None] * state.numpy()
-    np.testing.assert_allclose(shown[..., :6].numpy(), faded, rtol=1e-4, atol=1e-9)
-
-
 def test_one_row_and_many_rows_give_the_same(policy: Policy) -> None:
     seen, states = torch.from_numpy(policy.observations(6)), torch.from_numpy(policy.states(6))
     with torch.no_grad():
