@@ -24,6 +24,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.chaos.scene import ENDLESS, Scene, resident_mib, say, scene
+from benchmarks.fleet.noting_learner import STAGES
+from benchmarks.fleet.swarm import ENVIRONMENTS
 from benchmarks.running import cpu_seconds, machine, table
 
 _PER_PROCESS = 250
@@ -53,16 +55,28 @@ def main() -> int:
     )
     options.add_argument("--pixels", action="store_true", help="measure the maximum with frames like those of Pong")
     options.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the learner, with --pixels")
+    options.add_argument("--no-gradients", action="store_true", help="with --pixels, join batches only: see below")
     options.add_argument("--batch", type=int, default=16, help="rollouts of a batch, with --pixels")
+    options.add_argument("--rollout-length", type=int, default=16, help="with --pixels (default: %(default)d)")
     options.add_argument("--per-process", type=int, default=1, help="actors of a process, with --pixels")
     options.add_argument("--plot", type=Path, help="picture of the results to write")
     parsed = options.parse_args()
     if parsed.pixels:
+        gradients = not parsed.no_gradients
         made = [
-            pixels(count, parsed.device, parsed.batch, parsed.seconds, parsed.per_process) for count in parsed.actors
+            pixels(
+                count,
+                parsed.device,
+                parsed.batch,
+                parsed.seconds,
+                parsed.per_process,
+                parsed.rollout_length,
+                gradients=gradients,
+            )
+            for count in parsed.actors
         ]
         print(f"{machine()}; {parsed.seconds:g} s each\n")
-        print(table(PIXELS_HEADER, made))
+        print(table(PIXELS_HEADER if gradients else PIXELS_HEADER + STAGES_HEADER, made))
         return 0
     rows = []
     for count in parsed.actors:
@@ -171,8 +185,20 @@ PIXELS_HEADER = (
 )
 
 
-def pixels(count: int, device: str, batch: int, seconds: float, per_process: int) -> tuple[str, ...]:
-    """Measure env_steps/s from simulated actors with pixels to the gradient. Return a row of PIXELS_HEADER."""
+def pixels(
+    count: int,
+    device: str,
+    batch: int,
+    seconds: float,
+    per_process: int,
+    rows: int = 16,
+    *,
+    gradients: bool = True,
+) -> tuple[str, ...]:
+    """Measure env_steps/s from simulated actors with pixels to the gradient. Return a row of PIXELS_HEADER.
+
+    Without gradients, batches are only joined: a row of PIXELS_HEADER and STAGES_HEADER.
+    """
     settings = {
         "policy.encoder": "nature",
         "training.algorithm": "impala",
@@ -181,14 +207,19 @@ def pixels(count: int, device: str, batch: int, seconds: float, per_process: int
         "training.minibatches": 1,
         "training.device": device,
         "collection.envs_per_actor": 16,
-        "collection.rollout_length": 16,
+        "collection.rollout_length": rows,
         "service.queue_megabytes": 256,
     }
     words = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
     with scene() as here:
         router = here.router()
         words += ["--connect", here.address, "--run-dir", here.folder / "fleet", "--actors", count, *ENDLESS]
-        learner = here.start("learner", "pong", *words)
+        notes = here.folder / "stages"
+        if gradients:
+            learner = here.start("learner", "pong", *words)
+        else:
+            module = [sys.executable, "-m", "benchmarks.fleet.noting_learner", "--no-gradients", notes]
+            learner = here.run([*map(str, module), "pong", *map(str, words)], Path.cwd())
         learner.expect("actors join with")
         swarm = Swarm(here, count, 1e6, seconds, "pixels", per_process=per_process)
         try:
@@ -197,9 +228,10 @@ def pixels(count: int, device: str, batch: int, seconds: float, per_process: int
             before = [cpu_seconds(pid) for pid in pids]
             swarm.go()
             time.sleep(0.3 * seconds)  # the recording of a GPU's graph is not measured
-            began, first = time.monotonic(), here.status()
+            began, first, stages = time.monotonic(), here.status(), _last_line(notes)
             time.sleep(0.65 * seconds)
             last, took = here.status(), time.monotonic() - began
+            stages = _per_rollout(ENVIRONMENTS * rows, stages, _last_line(notes))
             shares = [f"{(cpu_seconds(pid) - old) / seconds:.0%}" for pid, old in zip(pids, before, strict=True)]
             results = swarm.results()
         finally:
@@ -210,7 +242,31 @@ def pixels(count: int, device: str, batch: int, seconds: float, per_process: int
     acks = " and ".join(f"{1000 * value:.1f}" for value in np.quantile(latencies, (0.5, 0.99)))
     rate = (last.env_steps - first.env_steps) / took
     lag = "?" if last.policy_lag_mean is None else f"{last.policy_lag_mean:.1f}"
-    return str(count), f"{256 * batch:,}", f"{rate:,.0f}", acks, lag, *shares
+    return str(count), f"{ENVIRONMENTS * rows * batch:,}", f"{rate:,.0f}", acks, lag, *shares, *stages
+
+
+STAGES_HEADER = (
+    *(f"{name}, us" for name in ("zenoh", *dict.fromkeys(name for name, _, _ in STAGES), "other", "all")),
+    "rows/s of a core",
+    "cores for 250k rows/s",
+)
+
+
+def _last_line(notes: Path) -> dict[str, float]:
+    """Return what a learner without gradients noted last; empty for another learner."""
+    return json.loads(notes.read_text().splitlines()[-1]) if notes.exists() else {}
+
+
+def _per_rollout(rows: int, before: dict[str, float], after: dict[str, float]) -> tuple[str, ...]:
+    """Return the cells of STAGES_HEADER: CPU microseconds of each stage of a rollout, of all, and what follows."""
+    if not after:
+        return ()
+    spent = {name: after[name] - before.get(name, 0.0) for name in after}
+    rollouts, everything = spent.pop("rollouts"), spent.pop("all")
+    spent |= {"other": everything - sum(spent.values()), "all": everything}
+    cells = [f"{1e6 * spent.get(name.removesuffix(', us'), 0.0) / rollouts:.0f}" for name in STAGES_HEADER[:-2]]
+    rate = rows * rollouts / everything
+    return *cells, f"{rate:,.0f}", f"{250_000 / rate:.2f}"
 
 
 def _snapshots(notes: Path, came: Sequence[Sequence[tuple[int, float]]], began: float, seconds: float) -> dict:
