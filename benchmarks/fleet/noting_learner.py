@@ -49,9 +49,10 @@ class Stages:
         self._calls: dict[str, int] = defaultdict(int)
         self._inner = threading.local()
         for name, owner, attribute in STAGES:
-            found = vars(owner)[attribute]
-            timed = self._timed(name, found.fget if isinstance(found, property) else found)
-            setattr(owner, attribute, property(timed) if isinstance(found, property) else timed)
+            found: Any = vars(owner)[attribute]
+            is_property = isinstance(found, property)
+            timed = self._timed(name, getattr(found, "fget", found))
+            setattr(owner, attribute, property(timed) if is_property else timed)
 
     def _timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
