@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.fleet.__main__ import PIXELS_HEADER, pixels
+from benchmarks.fleet.__main__ import PIXELS_HEADER, PixelsFleet
 from benchmarks.fleet.swarm import ENVIRONMENTS, PIXELS, recorded
 from benchmarks.learner_speed import NETWORKS
 from benchmarks.running import learning_rate, machine, table
@@ -97,6 +97,14 @@ def learner_rate(
     return found
 
 
+def learner_alone(device: str, rows: int, batch: int, seconds: float) -> float:
+    """Return the rows per second of Learner.step with the settings of a fleet with pixels, on one thread of a CPU."""
+    keep_freed_memory()
+    policy, _, _, _ = NETWORKS["nature"]
+    settings = {"algorithm": "impala", "batch_rollouts": batch, "threads": 1}
+    return learner_rate(policy, PIXELS, rows, batch * ENVIRONMENTS, device, seconds, **settings)
+
+
 def join_rate(width: int, device: str, seconds: float) -> float:
     """Measure the joining of rollouts alone, in rows per second."""
     batch, assembler = (
@@ -166,6 +174,17 @@ def learner_table(device: str, sizes: list[int], seconds: float, parts: list[str
     return table(header, lines)
 
 
+def fleet_table(device: str, sizes: list[int], seconds: float, actors: int) -> str:
+    """Return the table of simulated actors that send to the learner, for rollouts of 16 rows, then of 64."""
+    lines = []
+    for rows, length in [*((rows, _ROWS) for rows in sizes), (max(sizes), 4 * _ROWS)]:
+        batch = max(rows // (length * ENVIRONMENTS), 1)
+        limit = learner_alone(device, length, batch, seconds / 8)
+        fleet = PixelsFleet(device=device, batch=batch, seconds=seconds, rows=length, limit=limit)
+        lines.append((length, *fleet.measured(actors)))
+    return table(("rows of a rollout", *PIXELS_HEADER), lines)
+
+
 def pong(device: str, env_steps: int, actors: int) -> float:
     """Measure env_steps/s of `daedalus train pong` with the Nature network, after the warm-up."""
     settings = {
@@ -206,8 +225,7 @@ def main() -> None:
     if {"learner", "limit"} & set(parsed.parts):
         print(learner_table(parsed.device, parsed.rows, parsed.seconds, parsed.parts), "\n", flush=True)
     if "fleet" in parsed.parts:
-        lines = [pixels(parsed.actors, parsed.device, rows // 256, parsed.fleet_seconds, 1) for rows in parsed.rows]
-        print(table(PIXELS_HEADER, lines), "\n", flush=True)
+        print(fleet_table(parsed.device, parsed.rows, parsed.fleet_seconds, parsed.actors), "\n", flush=True)
     if "pong" in parsed.parts:
         print(
             f"Pong with {parsed.actors} actors: {pong(parsed.device, parsed.env_steps, parsed.actors):,.0f} env_steps/s"
