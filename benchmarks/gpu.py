@@ -28,7 +28,9 @@ from benchmarks.learner_speed import NETWORKS
 from benchmarks.running import learning_rate, machine, table
 from daedalus.algorithms.batch import BatchAssembler
 from daedalus.learner.run.process_resources import keep_freed_memory
+from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
+from daedalus.learner.training.update_graphs import check_device
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -180,8 +182,9 @@ def fleet_table(device: str, sizes: list[int], seconds: float, actors: int) -> s
     for rows, length in [*((rows, _ROWS) for rows in sizes), (max(sizes), 4 * _ROWS)]:
         batch = max(rows // (length * ENVIRONMENTS), 1)
         limit = learner_alone(device, length, batch, seconds / 8)
-        fleet = PixelsFleet(device=device, batch=batch, seconds=seconds, rows=length, limit=limit)
-        lines.append((length, *fleet.measured(actors)))
+        # While one actor of a process waits for its answer, the other sends.
+        fleet = PixelsFleet(device=device, batch=batch, seconds=seconds, per_process=2, rows=length, limit=limit)
+        lines.append((length, *fleet.measured(2 * actors)))
     return table(("rows of a rollout", *PIXELS_HEADER), lines)
 
 
@@ -211,9 +214,16 @@ def main() -> None:
     options.add_argument("--rows", nargs="+", type=int, default=[256, 1024, 4096])
     options.add_argument("--seconds", type=float, default=4.0, help="duration of each measurement of the learner")
     options.add_argument("--fleet-seconds", type=float, default=25.0)
-    options.add_argument("--actors", type=int, default=max((os.cpu_count() or 2) - 2, 2), help="of the fleet and Pong")
+    options.add_argument(
+        "--actors", type=int, default=max((os.cpu_count() or 2) - 2, 2), help="of Pong, and half of the fleet's"
+    )
     options.add_argument("--env-steps", type=int, default=1_000_000, help="of Pong")
     parsed = options.parse_args()
+    if parsed.device == "cuda":
+        try:
+            check_device("auto")
+        except SettingsError as error:
+            options.error(str(error))
     keep_freed_memory()
     torch.set_num_threads(1)
     card = torch.cuda.get_device_name() if parsed.device == "cuda" else "no GPU"

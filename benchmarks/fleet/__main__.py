@@ -30,13 +30,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from hosts import Network
+from hosts import Network, NoHostsError
 from processes import Running
 
 from benchmarks.chaos.scene import ENDLESS, Scene, resident_mib, say, scene
 from benchmarks.fleet.noting_learner import STAGES
 from benchmarks.fleet.swarm import ENVIRONMENTS
 from benchmarks.running import COMMAND, cpu_seconds, machine, table
+from daedalus.learner.run.settings import SettingsError
 
 _PER_PROCESS = 250
 _HEADER = (
@@ -72,23 +73,13 @@ def main() -> int:
     options.add_argument("--per-process", type=int, default=1, help="actors of a process, with --pixels")
     options.add_argument("--plot", type=Path, help="picture of the results to write")
     parsed = options.parse_args()
+    of_pixels = ("device", "no_gradients", "hosts", "batch", "rollout_length", "per_process")
+    useless = ("rate", "plot") if parsed.pixels else of_pixels
+    given = [f"--{name.replace('_', '-')}" for name in useless if getattr(parsed, name) != options.get_default(name)]
+    if given:
+        options.error(f"{', '.join(given)}: no effect {'with' if parsed.pixels else 'without'} --pixels")
     if parsed.pixels:
-        from benchmarks.gpu import learner_alone
-
-        fleet = PixelsFleet(
-            device=parsed.device,
-            batch=parsed.batch,
-            seconds=parsed.seconds,
-            per_process=parsed.per_process,
-            rows=parsed.rollout_length,
-            hosts=parsed.hosts,
-            gradients=not parsed.no_gradients,
-        )
-        if fleet.gradients:
-            fleet = replace(fleet, limit=learner_alone(parsed.device, fleet.rows, fleet.batch, parsed.seconds / 4))
-        made = [fleet.measured(count) for count in parsed.actors]
-        print(f"{machine()}; {parsed.seconds:g} s each\n")
-        print(table(PIXELS_HEADER if fleet.gradients else PIXELS_HEADER + STAGES_HEADER, made))
+        print(_pixels_table(parsed))
         return 0
     rows = []
     for count in parsed.actors:
@@ -100,6 +91,28 @@ def main() -> int:
     if parsed.plot:
         _plot(rows, parsed.plot)
     return 0
+
+
+def _pixels_table(parsed: argparse.Namespace) -> str:
+    from benchmarks.gpu import learner_alone
+
+    fleet = PixelsFleet(
+        device=parsed.device,
+        batch=parsed.batch,
+        seconds=parsed.seconds,
+        per_process=parsed.per_process,
+        rows=parsed.rollout_length,
+        hosts=parsed.hosts,
+        gradients=not parsed.no_gradients,
+    )
+    try:
+        if fleet.gradients:
+            fleet = replace(fleet, limit=learner_alone(parsed.device, fleet.rows, fleet.batch, parsed.seconds / 4))
+        made = [fleet.measured(count) for count in parsed.actors]
+    except (SettingsError, NoHostsError) as error:
+        raise SystemExit(str(error)) from None
+    header = PIXELS_HEADER if fleet.gradients else PIXELS_HEADER + STAGES_HEADER
+    return f"{machine()}; {parsed.seconds:g} s each\n\n{table(header, made)}"
 
 
 class Swarm:
