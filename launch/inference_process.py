@@ -22,7 +22,13 @@ from typing import Any, NoReturn
 import numpy as np
 
 from daedalus.launch.logs import configure_logging
-from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
+from daedalus.launch.process_lifecycle import (
+    exit_on_thread_exceptions,
+    exit_status,
+    exit_with_parent,
+    raise_descriptor_limit,
+    stop_on_signals,
+)
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES, PolicyError
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
@@ -168,7 +174,7 @@ class Inference:
                     return True
                 case _:
                     raise ValueError(f"unexpected packet {packet[:40]!r}")
-        except (PolicyError, ValueError, KeyError, IndexError) as error:
+        except (PolicyError, ValueError, TypeError, KeyError, IndexError) as error:
             actor.answer({"error": message_line(error)[:1000]})
         finally:
             for descriptor in descriptors:
@@ -254,6 +260,7 @@ def main() -> int:
     stop = stop_on_signals(exit_if_stuck=True)
     if parsed.exit_with_parent:
         exit_with_parent(stop)
+    raise_descriptor_limit()  # an actor has three
     threads = max((os.cpu_count() or 1) // 2, 1)  # actors that wait leave their cores
     Inference(parsed.device, threads, stop).serve(parsed.path)
     return 0

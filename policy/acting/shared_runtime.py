@@ -24,12 +24,12 @@ from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.program_session import CALL_SECONDS, STOP_SECONDS
 from daedalus.policy.acting.runtime import Choice
 from daedalus.policy.user_code import message_line
-from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
 
 PACKET_BYTES = 4096  # at most, of a packet
 _MAX_REGION_BYTES = 8 << 30
 _ALIGNMENT = 64
-_DTYPES = {"bool", "uint8", "int8", "uint16", "int16", "int32", "uint32", "int64", "float32"}
+_DTYPES = {"bool", "uint8", "uint16", "int64", "float32"}
 _POLL_SECONDS = 0.2
 _RETRY_SECONDS = 0.1
 
@@ -156,7 +156,7 @@ class SharedRuntime:
             self._allocate(weights, rows=1)
             return
         held = self._region.named("weights/")
-        if {name: each.shape for name, each in held.items()} != {name: each.shape for name, each in weights.items()}:
+        if _shapes_of(held) != _shapes_of(weights):
             raise PolicyError("the snapshot has other weights, or weights of other shapes, than the one before it")
         for name, values in weights.items():
             held[name][...] = values
@@ -200,18 +200,19 @@ class SharedRuntime:
         return Choice({name.removeprefix("actions/"): values for name, values in chosen.items()}, log_probs, next_state)
 
     def _shapes(self, weights: dict[str, np.ndarray], rows: int) -> list[Shape]:
-        spaces = self._spaces
-        observations, actions = spaces.observations.items(), spaces.actions.items()
-        shapes = [Shape(f"weights/{name}", "float32", values.shape) for name, values in weights.items()]
-        shapes += [
-            Shape(f"in/observations/{name}", str(np.dtype(each.dtype)), (rows, *each.stacked_shape))
-            for name, each in observations
-        ]
-        shapes += [Shape(f"in/masks/{name}", "bool", (rows, size)) for name, size in spaces.masks.items()]
-        shapes += [Shape(f"in/{name}", "float32", (rows, self._sizes[name])) for name in ("state", "uniform", "normal")]
-        shapes += [Shape("in/epsilon", "float32", (rows, 1)), Shape("out/log_prob", "float32", (rows,))]
-        shapes += [Shape("out/next_state", "float32", (rows, self._sizes["state"]))]
-        shapes += [Shape(f"out/actions/{name}", str(np.dtype(each.dtype)), (rows, each.size)) for name, each in actions]
+        sizes = self._sizes
+        shapes = [Shape(f"weights/{name}", dtype, shape) for name, (shape, dtype) in _shapes_of(weights).items()]
+        for name, space in self._spaces.observations.items():
+            shapes.append(Shape(f"in/observations/{name}", space.dtype, (rows, *space.stacked_shape)))
+        for name, choices in self._spaces.masks.items():
+            shapes.append(Shape(f"in/masks/{name}", "bool", (rows, choices)))
+        for name, size in (*((each, sizes[each]) for each in ("state", "uniform", "normal")), ("epsilon", 1)):
+            shapes.append(Shape(f"in/{name}", "float32", (rows, size)))
+        for name, space in self._spaces.actions.items():
+            dtype = "int64" if isinstance(space, DiscreteSpace) else "float32"  # as OnnxRuntime has them
+            shapes.append(Shape(f"out/actions/{name}", dtype, (rows, space.size)))
+        shapes.append(Shape("out/log_prob", "float32", (rows,)))
+        shapes.append(Shape("out/next_state", "float32", (rows, sizes["state"])))
         return shapes
 
     def _ask(self, what: str) -> None:
@@ -244,7 +245,7 @@ class SharedRuntime:
                     self._exchange("load", self._region, deadline)
             except OSError:  # it starts
                 self._disconnect()
-                self._stop.wait(_RETRY_SECONDS)
+                time.sleep(_RETRY_SECONDS)
             else:
                 return sizes
 
@@ -282,3 +283,7 @@ class SharedRuntime:
         if self._socket is not None:
             self._socket.close()
         self._socket = None
+
+
+def _shapes_of(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[tuple[int, ...], str]]:
+    return {name: (array.shape, str(array.dtype)) for name, array in arrays.items()}
