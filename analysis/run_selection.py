@@ -94,8 +94,13 @@ def checked_tag(tag: str) -> str:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    """Return the runs of a folder, links last. A hidden one is being restored or removed."""
-    found = [each.parent for each in folder.glob(f"*/{CONFIG}") if not each.parent.name.startswith(".")]
+    """Return the runs of a folder, and those of the roles of a game in it, links last.
+
+    A hidden one is being restored or removed.
+    """
+    found = [each.parent for each in folder.glob(f"*/{CONFIG}")]
+    found += [each.parent for each in folder.glob(f"*/*/{CONFIG}") if not is_run(each.parent.parent)]
+    found = [each for each in found if not any(part.startswith(".") for part in each.relative_to(folder).parts)]
     return sorted(found, key=lambda run: (run.is_symlink(), run))
 
 

@@ -3,6 +3,9 @@
     pip install -e ".[benchmark]"
     python -m benchmarks.peer_ppo --env LunarLander-v3 --env-steps 500000 --seed 11
 
+Agents of a PettingZoo game that ends for all at once share one policy (parameter sharing): each is an environment of
+its own, and env_steps count steps of the game. Observations of pictures are shrunk to 84 x 84 grey pixels.
+
 It has MultiInputPolicy for Dict observations, CnnPolicy for images, else MlpPolicy. It refuses texts in observations
 and images as small as those of MiniGrid: there it gets the numbers as one array. The score is the mean return of the
 last 100 training episodes.
@@ -13,11 +16,16 @@ import importlib
 import json
 import statistics
 import time
+from collections.abc import Callable, Mapping
+from typing import Any
 
+import cv2
 import gymnasium
+import numpy as np
 from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.vec_env import DummyVecEnv  # pyright: ignore[reportMissingImports]
 
 _ENVIRONMENTS, _EPISODES = 8, 100
 _SMALLEST_IMAGE = 36  # pixels of the shorter side that its CnnPolicy takes
@@ -54,6 +62,60 @@ def accepted(environment: gymnasium.Env) -> gymnasium.Env:
     return gymnasium.wrappers.FlattenObservation(gymnasium.wrappers.FilterObservation(environment, kept))
 
 
+class SharedPolicy(DummyVecEnv):
+    """All agents of some copies of a game, as environments of their own."""
+
+    def __init__(self, make: Callable[[], Any], copies: int, seed: int) -> None:
+        games = [make() for _ in range(copies)]
+        agents = games[0].possible_agents
+        space = games[0].observation_space(agents[0])
+        self._pictures = len(space.shape) == 3
+        if self._pictures:
+            space = gymnasium.spaces.Box(0, 255, (84, 84, 1), np.uint8)
+        super(DummyVecEnv, self).__init__(copies * len(agents), space, games[0].action_space(agents[0]))
+        self._games, self._agents, self._seed = games, agents, seed
+        self._returns = np.zeros(self.num_envs)
+
+    def _seen(self, observations: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        seen = [observations[agent] for agent in self._agents]
+        if not self._pictures:
+            return seen
+        size, area = (84, 84), cv2.INTER_AREA
+        return [
+            cv2.resize(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), size, interpolation=area)[..., None] for each in seen
+        ]
+
+    def reset(self) -> np.ndarray:
+        """Begin an episode in each copy."""
+        return np.stack(
+            [
+                seen
+                for copy, game in enumerate(self._games)
+                for seen in self._seen(game.reset(seed=self._seed + copy)[0])
+            ]
+        )
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Make a step in each copy; a copy that ends begins its next episode."""
+        seen, rewards, dones, infos = [], [], [], []
+        rows = self.actions.reshape(len(self._games), len(self._agents), *self.actions.shape[1:])
+        for game, actions in zip(self._games, rows, strict=True):
+            observations, reward, ended, cut, _ = game.step(dict(zip(self._agents, actions, strict=True)))
+            now, done = self._seen(observations), not game.agents
+            rewards += [reward[agent] for agent in self._agents]
+            dones += [done] * len(self._agents)
+            infos += [
+                {"terminal_observation": last, "TimeLimit.truncated": cut[agent] and not ended[agent]} if done else {}
+                for agent, last in zip(self._agents, now, strict=True)
+            ]
+            seen += self._seen(game.reset()[0]) if done else now
+        self._returns += rewards
+        for index in np.flatnonzero(dones):
+            infos[index]["episode"] = {"r": self._returns[index], "l": 0, "t": 0}
+            self._returns[index] = 0
+        return np.stack(seen), np.array(rewards, np.float32), np.array(dones), infos
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--env", required=True)
@@ -64,16 +126,22 @@ def main() -> None:
     module, _, name = parsed.env.rpartition(":")
     if module or name.startswith("ALE/"):
         importlib.import_module(module or "ale_py")  # registers its environments
-    environments = make_vec_env(
-        name, n_envs=_ENVIRONMENTS, seed=parsed.seed, env_kwargs=parsed.kwargs, wrapper_class=accepted
-    )
+    agents = 1
+    if name.startswith(("pettingzoo.", "mpe2.")):
+        game = importlib.import_module(name)
+        environments = SharedPolicy(lambda: game.parallel_env(**parsed.kwargs), _ENVIRONMENTS, parsed.seed)
+        agents = environments.num_envs // _ENVIRONMENTS
+    else:
+        environments = make_vec_env(
+            name, n_envs=_ENVIRONMENTS, seed=parsed.seed, env_kwargs=parsed.kwargs, wrapper_class=accepted
+        )
     model = PPO(policy_for(environments.observation_space), environments, seed=parsed.seed, device="cpu")
     returns = Returns()
     began = time.monotonic()
-    model.learn(parsed.env_steps, callback=returns)
+    model.learn(agents * parsed.env_steps, callback=returns)
     seconds = time.monotonic() - began
-    score = statistics.fmean(returns.returns[-_EPISODES:]) if returns.returns else None
-    print(json.dumps({"score": score, "seconds": seconds, "env_steps": model.num_timesteps}))
+    score = statistics.fmean(returns.returns[-_EPISODES * agents :]) if returns.returns else None
+    print(json.dumps({"score": score, "seconds": seconds, "env_steps": model.num_timesteps // agents}))
 
 
 if __name__ == "__main__":

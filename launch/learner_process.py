@@ -178,7 +178,7 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     modules.check(spec.learner_modules)  # the learner makes no environment
     spec = with_record(spec, modules)
     if options.prepared is None:  # else the program that prepared the run has said it
-        warn_of_unread(new.choice.assignments, new.choice.settings, spec)
+        warn_of_unread(new.choice.names(), spec)
     exists = (directory / run_directory.CONFIG).exists()
     return ChosenRun(spec=spec, directory=options.here / directory, exists=exists, changed=changed, modules=modules)
 
@@ -192,6 +192,9 @@ def _resumed_spec(before: RunSpec, new: NewRun, directory: Path) -> RunSpec:
     # The settings that --env begins with depend on the environment, which need not be made for this.
     chosen = new.choice if new.choice.is_named else changes
     spec = chosen.spec(before.model_dump(mode="json", exclude_none=True))
+    if spec.environment.package is None:  # then the run has the one that was installed when it began
+        environment = spec.environment.model_copy(update={"package": before.environment.package})
+        spec = spec.model_copy(update={"environment": environment})
     other = fixed_changes(before, spec) or differing(changes.spec(), spec)
     if other:
         raise SettingsError(

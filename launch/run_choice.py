@@ -16,6 +16,7 @@ from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import (
     SettingsError,
     assign,
+    changed_settings,
     choose_algorithm,
     override,
     preset_names,
@@ -82,6 +83,15 @@ class RunChoice:
                 "function that makes it"
             )
         return spec
+
+    def names(self) -> set[str]:
+        """Return the settings that were chosen; of a file, those that differ from the defaults of this release."""
+        chosen = {*(assignment.partition("=")[0].strip() for assignment in self.assignments), *self.settings}
+        if self.preset is not None and self.preset not in preset_names():
+            sections = read_preset(self.preset)
+            values = {f"{section}.{key}": each for section in sections for key, each in sections[section].items()}
+            chosen.update(changed_settings(values))
+        return chosen
 
     def directory(self, spec: RunSpec) -> Path:
         """Return the default run directory, named after the preset or file, or after the environment.
@@ -216,13 +226,12 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
         spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
     if problem := unmeasured_target(spec):
         raise SettingsError(problem)
-    warn_of_unread(choice.assignments, choice.settings, spec)
+    warn_of_unread(choice.names(), spec)
     return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
 
 
-def warn_of_unread(assignments: Sequence[str], settings: Mapping[str, Any], spec: RunSpec) -> None:
+def warn_of_unread(chosen: set[str], spec: RunSpec) -> None:
     """Log which settings that a user chose have no effect in the run."""
-    chosen = {*(assignment.partition("=")[0].strip() for assignment in assignments), *settings}
     if unread := sorted(chosen & unread_settings(spec)):
         _logger.warning("no effect in this run (algorithm %s): %s", spec.training.algorithm, ", ".join(unread))
 

@@ -125,6 +125,7 @@ class GameEnvironments:
             self._random[number] = np.random.default_rng(seed + number)
             self._begin_match(number)
             self._note(number, self._call("reset", number, seed + number))
+        self.acting &= ~self._ended  # an episode that ends before its first action has no beginning
         self._film()
         return self.observations
 

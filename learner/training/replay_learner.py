@@ -1,5 +1,6 @@
 """The learner of an algorithm with a replay buffer: rollouts go into it, and minibatches of it make the updates."""
 
+import contextlib
 import math
 import secrets
 import time
@@ -15,6 +16,7 @@ from daedalus.learner.run.process_resources import available_memory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.optimizers import build_optimizer
+from daedalus.learner.training.update_graphs import memory_faults
 from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
@@ -79,6 +81,7 @@ class ReplayLearner(Learner):
         """Add rollouts to the buffer, and make the updates that are due, for half a second at most.
 
         While `updates_due` is not 0, the caller calls again, without rollouts. See Learner.
+        Raises SettingsError if the GPU has too little memory for a minibatch.
         """
         self.far_outside = {}
         if rollouts:
@@ -89,7 +92,8 @@ class ReplayLearner(Learner):
         end = time.monotonic() + _SLICE_SECONDS
         while self.updates_due and time.monotonic() < end:
             self._owed -= 1.0
-            self._update(progress)
+            with memory_faults(self._spec.minibatch_rows, self._fitting_minibatch, "training.minibatch_rows"):
+                self._update(progress)
         return []
 
     def _receive(self, rollouts: Sequence[Rollout]) -> None:
@@ -100,10 +104,19 @@ class ReplayLearner(Learner):
         self._merge_observations([seen[rollout] for rollout in kept])
         self.metrics.add_batch(batch)
 
+    def _fitting_minibatch(self) -> int:
+        """Return the number of rows of a minibatch, by halves of it, whose gradients fit into the device's memory."""
+        rows = self._spec.minibatch_rows
+        while rows := rows // 2:
+            with contextlib.suppress(torch.OutOfMemoryError):
+                self._algorithm.gradients(_moved(self._sampled(rows), self.device))
+                return rows
+        return 0
+
     def _update(self, progress: float) -> None:
         """Make one update, or skip it if a gradient is not finite."""
         spec = self._spec
-        transitions = self._sampled()
+        transitions = self._sampled(spec.minibatch_rows)
         gradients, terms = self._algorithm.gradients(_moved(transitions, self.device))
         norms = {name: float(torch.linalg.vector_norm(gradient)) for name, gradient in gradients.items()}
         self.policy_version += 1
@@ -119,16 +132,16 @@ class ReplayLearner(Learner):
         self.metrics.add_update(Terms(*terms), rate.new_tensor(math.hypot(*norms.values())))
         self.metrics.count_updates(1)
 
-    def _sampled(self) -> Transitions:
+    def _sampled(self, rows: int) -> Transitions:
         """Return a minibatch, with its share of demonstrations: Ball et al. (2023), "Efficient Online Reinforcement
         Learning with Offline Data", section 4.1."""
         spec = self._spec
         given, taught = len(self.demonstrations or ()), self.replay.taught
-        shown = round(spec.demonstration_share * spec.minibatch_rows) if given or taught else 0
+        shown = round(spec.demonstration_share * rows) if given or taught else 0
         if not len(self.replay):  # a person has done all so far
-            shown = spec.minibatch_rows
+            shown = rows
         helped = int((torch.rand(shown) < taught / (given + taught)).sum()) if taught else 0
-        counts = {self.replay.sample: spec.minibatch_rows - shown, self.replay.sample_taught: helped}
+        counts = {self.replay.sample: rows - shown, self.replay.sample_taught: helped}
         if self.demonstrations is not None:
             counts[self.demonstrations.sample] = shown - helped
         return joined([draw(count, spec.n_step, spec.discount_factor) for draw, count in counts.items() if count])

@@ -37,25 +37,28 @@ def check_device(precision: str) -> None:
 
 
 @contextlib.contextmanager
-def memory_faults(rows: int, fitting: Callable[[], int]) -> Iterator[None]:
+def memory_faults(
+    rows: int, fitting: Callable[[], int], remedy: str = "training.batch_rollouts, or more training.minibatches,"
+) -> Iterator[None]:
     """Raise SettingsError if a GPU lacks memory in the block.
 
     Args:
       rows: of the batch.
       fitting: returns the number of rows that fit into its memory.
+      remedy: the settings that choose the number of rows.
     """
     try:
         yield
     except torch.OutOfMemoryError as error:
         traceback.clear_frames(error.__traceback__)  # they hold the tensors of the attempt
         fit = fitting()
-        remedy = (
-            f"{fit:,} rows fit: set training.batch_rollouts, or more training.minibatches, accordingly"
+        advice = (
+            f"{fit:,} rows fit: set {remedy} accordingly"
             if fit
-            else ("nor do fewer: use smaller observations or a smaller network")
+            else "nor do fewer: use smaller observations or a smaller network"
         )
         raise SettingsError(
-            f"the updates of a batch of {rows:,} rows do not fit into the memory of the GPU; {remedy}"
+            f"the updates of a batch of {rows:,} rows do not fit into the memory of the GPU; {advice}"
         ) from None
 
 

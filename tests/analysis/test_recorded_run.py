@@ -100,7 +100,10 @@ class TestBadInput:
     def test_a_folder_stands_for_its_runs_once(self, tmp_path: Path) -> None:
         runs = [record(tmp_path / name) for name in ("a", "b")]
         (tmp_path / "other").mkdir()
-        assert find_runs([runs[1], tmp_path]) == [runs[1], runs[0]]
+        roles = [record(tmp_path / "tag" / name) for name in ("adversary", "agent")]
+        for hidden in ("a/league", ".tag.restored/agent", "tag/.agent.pruned"):
+            record(tmp_path / hidden)
+        assert find_runs([runs[1], tmp_path]) == [runs[1], runs[0], *roles]
 
     def test_a_run_of_several_paths_is_found_once(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)

@@ -107,6 +107,8 @@ def test_default_settings_of_a_policy_with_memory_have_fewer_updates_unless_they
 
 def test_a_learner_that_resumes_changes_the_settings_that_its_command_line_names(tmp_path: Path) -> None:
     spec = spec_of("cartpole", "--set", "training.learning_rate=0.5")
+    environment = spec.environment.model_copy(update={"package": "gymnasium==1.0.0"})  # found when the run began
+    spec = spec.model_copy(update={"environment": environment})
     run_directory.create(tmp_path / "run", spec)
 
     def resumed(*words: str) -> ChosenRun:

@@ -232,7 +232,7 @@ def test_texts_of_peers_are_shown_as_texts(gateway: RunningGateway, visit: Open)
     page.wait_for_selector("#actors tbody tr")
     assert page.locator("img").count() == 0
     for selector in ("#run", "#actors", "#log", "#notices"):
-        assert HOSTILE in text_of(page, selector)
+        page.locator(selector, has_text=HOSTILE).wait_for()  # events may come after the status
     assert page.title().startswith(HOSTILE)
 
 
@@ -261,7 +261,7 @@ def test_the_camera_is_second_and_settings_that_differ_are_first(
         assert order[:5] == ["summary", "learning", "league", "camera", "metrics"]
         assert page.locator("#league").is_hidden()  # of games only
         for selector in ("#changed", "#output"):
-            assert HOSTILE in text_of(page, selector)
+            page.locator(selector, has_text=HOSTILE).wait_for()
         assert page.locator("img").count() == 0
         assert page.locator("#unchanged td").is_hidden()
         page.locator("#unchanged-title").click()
@@ -310,6 +310,7 @@ def test_a_game_with_opponents_shows_ratings_and_who_beats_whom(gateway: Running
     show(gateway, run_status(league=league), rows)
     page = visit(f"http://127.0.0.1:{gateway.port}/").page
     page.wait_for_selector("#matrix tbody tr")
+    page.wait_for_selector("#rating .line", state="attached")  # rows may come after the status
     assert page.locator("#rating svg").get_attribute("aria-label") == "Rating: 1,313 at the end, from 0 to 20"
     assert page.locator("#win-rates h3").all_inner_texts() == [
         "Win rate against my_bots.Greedy",

@@ -11,7 +11,7 @@ import pytest
 import torch
 from building import identity, make_rollout
 
-from daedalus.algorithms.replay_buffer import ReplayBuffer
+from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions
 from daedalus.algorithms.sac import Sac
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
@@ -58,6 +58,19 @@ def trained(learner: ReplayLearner, *seeds: int) -> ReplayLearner:
         while learner.updates_due:
             learner.step([], 0.0)
     return learner
+
+
+def test_too_little_memory_is_reported_with_the_number_of_rows_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    compute = Sac.gradients
+
+    def limited(self: Sac, transitions: Transitions) -> Any:
+        if len(transitions.rewards) > 3:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return compute(self, transitions)
+
+    monkeypatch.setattr(Sac, "gradients", limited)
+    with pytest.raises(SettingsError, match=r"batch of 8 rows do not fit .*; 2 rows fit: set training.minibatch_rows"):
+        trained(ReplayLearner(spec_of(), SPACES), 0, 1)
 
 
 def test_each_row_earns_its_updates_after_the_beginning() -> None:

@@ -435,11 +435,24 @@ def test_settings_that_nothing_reads_are_known(settings: dict[str, Any], unread:
         assert hasattr(getattr(made, section), key)
 
 
-def test_settings_of_the_user_that_nothing_reads_are_named(caplog: pytest.LogCaptureFixture) -> None:
-    spec = RunChoice(env="CartPole-v1", algorithm="a2c").spec()
-    warn_of_unread(["training.clip_range=0.3"], {"training.passes": 2, "training.seed": 2}, spec)
-    warn_of_unread(["training.learning_rate=0.1"], {}, spec)
-    assert caplog.messages == ["no effect in this run (algorithm a2c): training.clip_range, training.passes"]
+def test_settings_of_the_user_that_nothing_reads_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "own.toml").write_text(
+        '[environment]\nid = "CartPole-v1"\n[training]\nalgorithm = "a2c"\nclip_range = 0.4\nrho_clip = 1.0'
+    )
+    for choice in (
+        RunChoice(
+            env="CartPole-v1",
+            algorithm="a2c",
+            assignments=["training.clip_range=0.3"],
+            settings={"training.passes": 2, "training.seed": 2},
+        ),
+        RunChoice(env="CartPole-v1", algorithm="a2c", assignments=["training.learning_rate=0.1"]),
+        RunChoice(preset=str(tmp_path / "own.toml")),  # its rho_clip is the default
+        RunChoice(preset="pong"),
+    ):
+        warn_of_unread(choice.names(), choice.spec())
+    start = "no effect in this run (algorithm a2c): training."
+    assert caplog.messages == [f"{start}clip_range, training.passes", f"{start}clip_range"]
 
 
 @pytest.mark.parametrize("table", [3, {"impala": 3}, {"impala": {"training": 3}}])
