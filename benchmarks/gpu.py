@@ -22,13 +22,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.fleet.__main__ import PIXELS_HEADER, pixels
+from benchmarks.fleet.__main__ import PIXELS_HEADER, PixelsFleet
 from benchmarks.fleet.swarm import ENVIRONMENTS, PIXELS, recorded
 from benchmarks.learner_speed import NETWORKS
 from benchmarks.running import learning_rate, machine, table
 from daedalus.algorithms.batch import BatchAssembler
 from daedalus.learner.run.process_resources import keep_freed_memory
+from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
+from daedalus.learner.training.update_graphs import check_device
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -95,6 +97,14 @@ def learner_rate(
     if learner.updates_skipped:
         raise SystemExit("updates were skipped: their gradients are not finite")
     return found
+
+
+def learner_alone(device: str, rows: int, batch: int, seconds: float) -> float:
+    """Return the rows per second of Learner.step with the settings of a fleet with pixels, on one thread of a CPU."""
+    keep_freed_memory()
+    policy, _, _, _ = NETWORKS["nature"]
+    settings = {"algorithm": "impala", "batch_rollouts": batch, "threads": 1}
+    return learner_rate(policy, PIXELS, rows, batch * ENVIRONMENTS, device, seconds, **settings)
 
 
 def join_rate(width: int, device: str, seconds: float) -> float:
@@ -166,6 +176,18 @@ def learner_table(device: str, sizes: list[int], seconds: float, parts: list[str
     return table(header, lines)
 
 
+def fleet_table(device: str, sizes: list[int], seconds: float, actors: int) -> str:
+    """Return the table of simulated actors that send to the learner, for rollouts of 16 rows, then of 64."""
+    lines = []
+    for rows, length in [*((rows, _ROWS) for rows in sizes), (max(sizes), 4 * _ROWS)]:
+        batch = max(rows // (length * ENVIRONMENTS), 1)
+        limit = learner_alone(device, length, batch, seconds / 8)
+        # While one actor of a process waits for its answer, the other sends.
+        fleet = PixelsFleet(device=device, batch=batch, seconds=seconds, per_process=2, rows=length, limit=limit)
+        lines.append((length, *fleet.measured(2 * actors)))
+    return table(("rows of a rollout", *PIXELS_HEADER), lines)
+
+
 def pong(device: str, env_steps: int, actors: int) -> float:
     """Measure env_steps/s of `daedalus train pong` with the Nature network, after the warm-up."""
     settings = {
@@ -192,9 +214,16 @@ def main() -> None:
     options.add_argument("--rows", nargs="+", type=int, default=[256, 1024, 4096])
     options.add_argument("--seconds", type=float, default=4.0, help="duration of each measurement of the learner")
     options.add_argument("--fleet-seconds", type=float, default=25.0)
-    options.add_argument("--actors", type=int, default=max((os.cpu_count() or 2) - 2, 2), help="of the fleet and Pong")
+    options.add_argument(
+        "--actors", type=int, default=max((os.cpu_count() or 2) - 2, 2), help="of Pong, and half of the fleet's"
+    )
     options.add_argument("--env-steps", type=int, default=1_000_000, help="of Pong")
     parsed = options.parse_args()
+    if parsed.device == "cuda":
+        try:
+            check_device("auto")
+        except SettingsError as error:
+            options.error(str(error))
     keep_freed_memory()
     torch.set_num_threads(1)
     card = torch.cuda.get_device_name() if parsed.device == "cuda" else "no GPU"
@@ -206,8 +235,7 @@ def main() -> None:
     if {"learner", "limit"} & set(parsed.parts):
         print(learner_table(parsed.device, parsed.rows, parsed.seconds, parsed.parts), "\n", flush=True)
     if "fleet" in parsed.parts:
-        lines = [pixels(parsed.actors, parsed.device, rows // 256, parsed.fleet_seconds, 1) for rows in parsed.rows]
-        print(table(PIXELS_HEADER, lines), "\n", flush=True)
+        print(fleet_table(parsed.device, parsed.rows, parsed.fleet_seconds, parsed.actors), "\n", flush=True)
     if "pong" in parsed.parts:
         print(
             f"Pong with {parsed.actors} actors: {pong(parsed.device, parsed.env_steps, parsed.actors):,.0f} env_steps/s"

@@ -24,6 +24,7 @@ import struct
 import threading
 import types
 import typing
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import msgpack
@@ -41,108 +42,122 @@ from daedalus.protocol.uploads import Gradient, Rollout
 def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[str, Any]:
     """Return the fields of a message as a plain map, and append its arrays to `arrays`, named `path` + field."""
     packed: dict[str, Any] = {}
-    for name, annotation in _fields(type(value)).items():
+    for name, kind, _, _, sparse in _fields(type(value)):
         item = getattr(value, name)
-        if annotation is np.ndarray or isinstance(item, np.ndarray):
-            arrays.append((path + name, item))
-        elif _is_optional_array(annotation):
-            pass  # without it
-        elif _is_array_map(annotation):
+        if kind == _ARRAYS:
             arrays.extend((f"{path}{name}/{key}", array) for key, array in item.items())
-        elif dataclasses.is_dataclass(annotation):
+        elif kind == _ARRAY or (kind == _OPTIONAL_ARRAY and item is not None):
+            arrays.append((path + name, item))
+        elif kind == _MESSAGE:
             packed[name] = pack(item, f"{path}{name}.", arrays)
         elif isinstance(item, BaseModel):
             packed[name] = item.model_dump(mode="json")
-        elif item is not None or name not in _sparse(type(value)):
+        elif kind == _VALUE and (item is not None or not sparse):
             packed[name] = item
     return packed
 
 
-def unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Build a message of class `cls` from a map made by `pack`, and remove its arrays from `arrays`.
+_Arrays = dict[str, np.ndarray | dict[str, np.ndarray]]  # by field: its array, or its map of arrays
+
+
+def unpack(cls: type, fields: dict[str, Any], path: str, arrays: _Arrays) -> Any:
+    """Build a message of class `cls` from a map made by `pack`, and from arrays.
 
     A missing field has its default. Fields that the class does not have are ignored: a newer release wrote them.
     Raises ValueError, which names the field, for one that is missing without a default, or of the wrong type.
     """
     values: dict[str, Any] = {}
-    optional = _optional(cls)
-    for name, annotation in _fields(cls).items():
-        if annotation is np.ndarray:
-            if path + name not in arrays:
+    for name, kind, read, optional, _ in _fields(cls):
+        if kind == _ARRAYS:
+            values[name] = arrays.get(path + name, {})
+        elif kind in (_ARRAY, _OPTIONAL_ARRAY):
+            values[name] = arrays.get(path + name)
+            if values[name] is None and kind == _ARRAY:
                 raise ValueError(f"array {path + name!r} is missing")
-            values[name] = arrays.pop(path + name)
-        elif _is_optional_array(annotation):
-            values[name] = arrays.pop(path + name, None)
-        elif _is_array_map(annotation):
-            prefix = f"{path}{name}/"
-            found = [key for key in arrays if key.startswith(prefix)]
-            values[name] = {key[len(prefix) :]: arrays.pop(key) for key in found}
         elif name in fields:
-            values[name] = _value(annotation, fields[name], path + name, arrays)
-        elif name not in optional:
+            values[name] = read(fields[name], path + name)
+        elif not optional:
             raise ValueError(f"field {path + name!r} is missing")
     return cls(**values)
 
 
-def has_array(cls: type, name: str) -> bool:
-    """Return whether messages of class `cls` have an array with this name."""
-    annotation = _fields(cls).get(name.partition("/")[0])
-    if "/" in name:
-        return _is_array_map(annotation)
-    return annotation is np.ndarray or _is_optional_array(annotation)
+_ARRAY, _OPTIONAL_ARRAY, _ARRAYS, _MESSAGE, _VALUE = range(5)  # kinds of fields
 
 
-def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+class _Field(NamedTuple):
+    """One field of a class of messages, read from its annotation once: annotations are slow to tell apart."""
+
+    name: str
+    kind: int
+    read: Callable[[Any, str], Any]  # returns the value of a field from what arrived and the field's name, or raises
+    optional: bool  # whether it has a default
+    sparse: bool  # whether it is not sent while it is None: few messages have it
+
+
+@functools.cache
+def _fields(cls: type) -> tuple[_Field, ...]:
+    hints, missing = typing.get_type_hints(cls), dataclasses.MISSING
+    return tuple(
+        _Field(
+            field.name,
+            _kind(hints[field.name]),
+            _reader(hints[field.name]),
+            field.default is not missing or field.default_factory is not missing,
+            bool(field.metadata.get("sparse")),
+        )
+        for field in dataclasses.fields(cls)
+    )
+
+
+def _kind(annotation: Any) -> int:
+    if annotation is np.ndarray:
+        return _ARRAY
+    if annotation == np.ndarray | None:
+        return _OPTIONAL_ARRAY
+    if typing.get_origin(annotation) is dict and typing.get_args(annotation)[1] is np.ndarray:
+        return _ARRAYS
+    return _MESSAGE if dataclasses.is_dataclass(annotation) else _VALUE
+
+
+@functools.cache
+def _array_fields(cls: type) -> dict[str, bool]:
+    """Return the names of the fields of arrays, and whether each is a map of them."""
+    kinds = (_ARRAY, _OPTIONAL_ARRAY, _ARRAYS)
+    return {field.name: field.kind == _ARRAYS for field in _fields(cls) if field.kind in kinds}
+
+
+def _reader(annotation: Any) -> Callable[[Any, str], Any]:
+    """Return the function that reads a field which is no array."""
     if isinstance(annotation, types.UnionType):  # `X | None`
-        if item is None:
-            return None
-        annotation = typing.get_args(annotation)[0]
+        read_present = _reader(typing.get_args(annotation)[0])
+        return lambda item, path: None if item is None else read_present(item, path)
     if dataclasses.is_dataclass(annotation):
-        if not isinstance(item, dict):
-            raise ValueError(f"field {path!r} must be a map")
-        return unpack(typing.cast(type, annotation), item, path + ".", arrays)
+        return functools.partial(_read_message, annotation)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation.model_validate(item, extra="ignore")
+        return lambda item, _: annotation.model_validate(item, extra="ignore")
     if typing.get_origin(annotation) is typing.Literal:
-        if not isinstance(item, str) or item not in typing.get_args(annotation):
-            raise ValueError(f"field {path!r} must be one of {', '.join(typing.get_args(annotation))}")
-        return item
+        return functools.partial(_read_literal, typing.get_args(annotation))
+    return functools.partial(_read_plain, annotation)
+
+
+def _read_message(cls: Any, item: Any, path: str) -> Any:
+    if not isinstance(item, dict):
+        raise ValueError(f"field {path!r} must be a map")
+    return unpack(cls, item, path + ".", {})
+
+
+def _read_literal(choices: tuple[Any, ...], item: Any, path: str) -> Any:
+    if not isinstance(item, str) or item not in choices:
+        raise ValueError(f"field {path!r} must be one of {', '.join(choices)}")
+    return item
+
+
+def _read_plain(annotation: Any, item: Any, path: str) -> Any:
     if type(item) is not annotation:
         raise ValueError(f"field {path!r} must be {annotation.__name__}, not {type(item).__name__}")
     if annotation is int and not 0 <= item < 2**63:
         raise ValueError(f"field {path!r} must be from 0 to 2^63 - 1")
     return item
-
-
-@functools.cache
-def _fields(cls: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
-
-
-@functools.cache
-def _sparse(cls: type) -> frozenset[str]:
-    """Return the names of the fields that are not sent while they are None: few messages have them."""
-    return frozenset(field.name for field in dataclasses.fields(cls) if field.metadata.get("sparse"))
-
-
-@functools.cache
-def _optional(cls: type) -> frozenset[str]:
-    """Return the names of the fields that have a default."""
-    missing = dataclasses.MISSING
-    return frozenset(
-        field.name
-        for field in dataclasses.fields(cls)
-        if field.default is not missing or field.default_factory is not missing
-    )
-
-
-def _is_optional_array(annotation: Any) -> bool:
-    return annotation == np.ndarray | None
-
-
-def _is_array_map(annotation: Any) -> bool:
-    return typing.get_origin(annotation) is dict and typing.get_args(annotation)[1] is np.ndarray
 
 
 PROTOCOL_VERSION = 11  # that this release reads, besides all from FIRST_VERSION on; docs/wire.md says when to raise it
@@ -195,14 +210,15 @@ def encode(message: Message) -> bytes:
     faults of the caller.
     """
     arrays: list[tuple[str, np.ndarray]] = []
-    fields = pack(message, "", arrays)
-    body = b"".join(part for name, array in arrays for part in _buffer(name, array))
-    content = {
-        "kind": type(message).__name__,
-        "fields": fields,
-        "arrays": [(name, _wire_dtype(name, array).str, array.shape, _is_swapped(array)) for name, array in arrays],
-        "size": len(body),
-    }
+    content = {"kind": type(message).__name__, "fields": pack(message, "", arrays), "arrays": []}
+    parts: list[bytes | memoryview] = []
+    for name, array in arrays:
+        dtype, swapped = _wire_dtype(name, array.dtype), _is_swapped(array)
+        content["arrays"].append((name, dtype.str, array.shape, swapped))
+        parts.append(np.ascontiguousarray(array.swapaxes(0, 1) if swapped else array, dtype).data)
+        parts.append(bytes(-array.nbytes % _ALIGNMENT))
+    body = b"".join(parts)
+    content["size"] = len(body)
     header = cast(bytes, msgpack.packb(content))
     if len(header) > LEARNER_LIMITS.max_header_bytes:
         raise ValueError(
@@ -238,8 +254,9 @@ def decode(data: bytes, limits: Limits) -> Message:
     if flags == _ZSTD and _KINDS[kind] not in _COMPRESSED:
         raise ProtocolError(f"a {kind} must not be compressed")
     layout = _read_layout(arrays, size, limits)
-    known = [entry for entry in layout if has_array(_KINDS[kind], entry.name)]
-    buffers = _read_arrays(known, _plain_body(flags, body, size))
+    known = _array_fields(_KINDS[kind])
+    layout = [entry for entry in layout if known.get(entry.name.partition("/")[0]) == ("/" in entry.name)]
+    buffers = _read_arrays(layout, _plain_body(flags, body, size))
     try:
         message = unpack(_KINDS[kind], fields, "", buffers)
     except ValidationError as error:
@@ -280,23 +297,16 @@ def _release_in(fields: dict[str, Any]) -> str:
 # ------------------------------------------------------------------------------------------- writing
 
 
-def _wire_dtype(name: str, array: np.ndarray) -> np.dtype:
-    dtype = array.dtype.newbyteorder("<")
-    if dtype.str not in _DTYPES:
-        raise ValueError(f"array {name!r} has dtype {array.dtype}, which the protocol does not support")
-    return dtype
+def _wire_dtype(name: str, dtype: np.dtype) -> np.dtype:
+    found = _DTYPES.get(dtype.str) or _DTYPES.get(dtype.newbyteorder("<").str)
+    if found is None:
+        raise ValueError(f"array {name!r} has dtype {dtype}, which the protocol does not support")
+    return found
 
 
 def _is_swapped(array: np.ndarray) -> bool:
     """Return whether the array is in memory with its second axis first; it is then sent in that order."""
-    return array.ndim >= 2 and not array.flags.c_contiguous and array.swapaxes(0, 1).flags.c_contiguous
-
-
-def _buffer(name: str, array: np.ndarray) -> tuple[bytes, bytes]:
-    if _is_swapped(array):
-        array = array.swapaxes(0, 1)
-    data = np.ascontiguousarray(array, dtype=_wire_dtype(name, array)).tobytes()
-    return data, bytes(-len(data) % _ALIGNMENT)
+    return not array.flags.c_contiguous and array.ndim >= 2 and array.swapaxes(0, 1).flags.c_contiguous
 
 
 # ------------------------------------------------------------------------------------------- reading
@@ -371,8 +381,9 @@ def _read_layout(arrays: list[Any], size: int, limits: Limits) -> list[_Entry]:
             raise ProtocolError(f"array {name!r} has an unsupported dtype")
         if not isinstance(shape, list) or len(shape) > _MAX_DIMENSIONS:
             raise ProtocolError(f"array {name!r} has an invalid shape")
-        if not all(type(side) is int and 0 <= side <= limits.max_bytes for side in shape):
-            raise ProtocolError(f"array {name!r} has an invalid shape")
+        for side in shape:
+            if type(side) is not int or not 0 <= side <= limits.max_bytes:
+                raise ProtocolError(f"array {name!r} has an invalid shape")
         if type(swapped) is not bool or (swapped and len(shape) < 2):
             raise ProtocolError(f"array {name!r} has an invalid swapped flag")
         layout.append(_Entry(name, _DTYPES[dtype], tuple(shape), swapped, offset))
@@ -401,21 +412,24 @@ def _plain_body(flags: int, body: memoryview, size: int) -> bytes | memoryview:
     return plain
 
 
-def _read_arrays(layout: list[_Entry], body: bytes | memoryview) -> dict[str, np.ndarray]:
-    arrays = {}
+def _read_arrays(layout: list[_Entry], body: bytes | memoryview) -> _Arrays:
+    arrays: _Arrays = {}
     for name, dtype, shape, swapped, offset in layout:
-        flat = np.frombuffer(body, np.uint8, math.prod(shape) * dtype.itemsize, offset)
-        if dtype == np.bool_ and flat.size and flat.max() > 1:
-            raise ProtocolError(f"array {name!r} has a bool that is neither 0 nor 1")
+        sides = (shape[1], shape[0], *shape[2:]) if swapped else shape
         try:
-            if swapped:
-                array = flat.view(dtype).reshape(shape[1], shape[0], *shape[2:]).swapaxes(0, 1)
-            else:
-                array = flat.view(dtype).reshape(shape)
+            array = np.ndarray(sides, dtype, body, offset)
         except ValueError:  # the product of the sides overflows although one of them is 0
             raise ProtocolError(f"array {name!r} has an invalid shape") from None
+        if dtype.char == "?" and array.size and array.view(np.uint8).max() > 1:
+            raise ProtocolError(f"array {name!r} has a bool that is neither 0 nor 1")
+        if swapped:
+            array = array.swapaxes(0, 1)
         array.flags.writeable = False
-        arrays[name] = array
+        field, in_map, key = name.partition("/")
+        if in_map:
+            cast(dict[str, np.ndarray], arrays.setdefault(field, {}))[key] = array
+        else:
+            arrays[name] = array
     return arrays
 
 

@@ -7,24 +7,37 @@ rollout of CartPole, 16 rows of 16 environments, repeatedly. First all actors to
 a rate that the learner can train on. The cost and the latencies then depend on the number of actors only. Then all
 actors send as fast as they get answers.
 
-    python -m benchmarks.fleet --actors 14 --pixels --device cuda --per-process 1
+    python -m benchmarks.fleet --actors 14 --pixels --device cuda
+    python -m benchmarks.fleet --actors 8 --pixels --hosts 2
+    python -m benchmarks.fleet --actors 32 --pixels --no-gradients --per-process 16 --rollout-length 64
 
 With --pixels, the frames are like those of Pong, and the learner trains the Nature network with `impala`, one pass over
-batches of --batch rollouts. Only the maximum is measured: env_steps/s from the network to the gradient.
+batches of --batch rollouts. Only the maximum is measured: env_steps/s from the network to the gradient, beside what the
+learner does alone with rollouts that are decoded. With --hosts the actors are in network namespaces, as on other hosts;
+that needs root. With --no-gradients the learner joins batches only: the table says what CPU time each stage of a
+rollout takes, and how many cores of the learner 250,000 rows a second would need.
 """
 
 import argparse
+import contextlib
+import itertools
 import json
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from hosts import Network, NoHostsError
+from processes import Running
 
 from benchmarks.chaos.scene import ENDLESS, Scene, resident_mib, say, scene
-from benchmarks.running import cpu_seconds, machine, table
+from benchmarks.fleet.noting_learner import STAGES
+from benchmarks.fleet.swarm import ENVIRONMENTS
+from benchmarks.running import COMMAND, cpu_seconds, machine, table
+from daedalus.learner.run.settings import SettingsError
 
 _PER_PROCESS = 250
 _HEADER = (
@@ -53,16 +66,20 @@ def main() -> int:
     )
     options.add_argument("--pixels", action="store_true", help="measure the maximum with frames like those of Pong")
     options.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the learner, with --pixels")
+    options.add_argument("--no-gradients", action="store_true", help="with --pixels, join batches only")
+    options.add_argument("--hosts", type=int, default=0, help="with --pixels, network namespaces of actors")
     options.add_argument("--batch", type=int, default=16, help="rollouts of a batch, with --pixels")
+    options.add_argument("--rollout-length", type=int, default=16, help="with --pixels (default: %(default)d)")
     options.add_argument("--per-process", type=int, default=1, help="actors of a process, with --pixels")
     options.add_argument("--plot", type=Path, help="picture of the results to write")
     parsed = options.parse_args()
+    of_pixels = ("device", "no_gradients", "hosts", "batch", "rollout_length", "per_process")
+    useless = ("rate", "plot") if parsed.pixels else of_pixels
+    given = [f"--{name.replace('_', '-')}" for name in useless if getattr(parsed, name) != options.get_default(name)]
+    if given:
+        options.error(f"{', '.join(given)}: no effect {'with' if parsed.pixels else 'without'} --pixels")
     if parsed.pixels:
-        made = [
-            pixels(count, parsed.device, parsed.batch, parsed.seconds, parsed.per_process) for count in parsed.actors
-        ]
-        print(f"{machine()}; {parsed.seconds:g} s each\n")
-        print(table(PIXELS_HEADER, made))
+        print(_pixels_table(parsed))
         return 0
     rows = []
     for count in parsed.actors:
@@ -76,19 +93,49 @@ def main() -> int:
     return 0
 
 
+def _pixels_table(parsed: argparse.Namespace) -> str:
+    from benchmarks.gpu import learner_alone
+
+    fleet = PixelsFleet(
+        device=parsed.device,
+        batch=parsed.batch,
+        seconds=parsed.seconds,
+        per_process=parsed.per_process,
+        rows=parsed.rollout_length,
+        hosts=parsed.hosts,
+        gradients=not parsed.no_gradients,
+    )
+    try:
+        if fleet.gradients:
+            fleet = replace(fleet, limit=learner_alone(parsed.device, fleet.rows, fleet.batch, parsed.seconds / 4))
+        made = [fleet.measured(count) for count in parsed.actors]
+    except (SettingsError, NoHostsError) as error:
+        raise SystemExit(str(error)) from None
+    header = PIXELS_HEADER if fleet.gradients else PIXELS_HEADER + STAGES_HEADER
+    return f"{machine()}; {parsed.seconds:g} s each\n\n{table(header, made)}"
+
+
 class Swarm:
     """Simulated actors in several processes."""
 
     def __init__(
-        self, here: Scene, count: int, rate: float, seconds: float, *kind: str, per_process: int = _PER_PROCESS
+        self,
+        address: str,
+        count: int,
+        rate: float,
+        seconds: float,
+        *kind: str,
+        per_process: int = _PER_PROCESS,
+        places: Sequence[Sequence[str]] = ((),),
     ) -> None:
+        """Start the processes. `places`: beginnings of command lines, each of which runs a command in another place."""
         each = [len(part) for part in np.array_split(np.arange(count), -(-count // per_process))]
         self._processes = []
-        for first, size in zip(np.cumsum([0, *each[:-1]]), each, strict=True):
-            words = [here.address, first, size, rate / count, seconds, *kind]
+        for place, first, size in zip(itertools.cycle(places), np.cumsum([0, *each[:-1]]), each, strict=False):
+            words = [address, first, size, rate / count, seconds, *kind]
             self._processes.append(
                 subprocess.Popen(
-                    [sys.executable, "-m", "benchmarks.fleet.swarm", *map(str, words)],
+                    [*place, sys.executable, "-m", "benchmarks.fleet.swarm", *map(str, words)],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     text=True,
@@ -137,7 +184,7 @@ def _measured(here: Scene, count: int, rate: float, seconds: float) -> dict[str,
     pids = {"learner": learner.process.pid, "router": router.process.pid}
     row: dict[str, float] = {"actors": count}
     for pace in (rate, 1e6):
-        swarm = Swarm(here, count, pace, seconds)
+        swarm = Swarm(here.address, count, pace, seconds)
         try:
             swarm.await_ready()
             began, before = time.monotonic(), {name: cpu_seconds(pid) for name, pid in pids.items()}
@@ -164,6 +211,7 @@ PIXELS_HEADER = (
     "actors",
     "rows of a batch",
     "env_steps/s",
+    "of the learner alone",
     "ack ms, p50 and p99",
     "policy lag",
     "CPU: learner",
@@ -171,46 +219,112 @@ PIXELS_HEADER = (
 )
 
 
-def pixels(count: int, device: str, batch: int, seconds: float, per_process: int) -> tuple[str, ...]:
-    """Measure env_steps/s from simulated actors with pixels to the gradient. Return a row of PIXELS_HEADER."""
-    settings = {
-        "policy.encoder": "nature",
-        "training.algorithm": "impala",
-        "training.batch_rollouts": batch,
-        "training.passes": 1,
-        "training.minibatches": 1,
-        "training.device": device,
-        "collection.envs_per_actor": 16,
-        "collection.rollout_length": 16,
-        "service.queue_megabytes": 256,
-    }
-    words = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
-    with scene() as here:
-        router = here.router()
-        words += ["--connect", here.address, "--run-dir", here.folder / "fleet", "--actors", count, *ENDLESS]
-        learner = here.start("learner", "pong", *words)
-        learner.expect("actors join with")
-        swarm = Swarm(here, count, 1e6, seconds, "pixels", per_process=per_process)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PixelsFleet:
+    """Simulated actors with pixels that send as fast as they get answers, and their learner."""
+
+    device: str
+    batch: int  # rollouts
+    seconds: float
+    per_process: int = 1  # actors
+    rows: int = 16  # of a rollout
+    hosts: int = 0  # network namespaces of actors; 0: they use the loopback
+    gradients: bool = True  # False: batches are only joined
+    limit: float | None = None  # rows/s of the learner alone
+
+    def measured(self, count: int) -> tuple[str, ...]:
+        """Return a row of PIXELS_HEADER for `count` actors and, without gradients, of STAGES_HEADER."""
+        with scene() as here, self._network(here) as (router, at_learner, at_actors, places):
+            notes = here.folder / "stages"
+            learner = self._learner(here, notes, "--connect", at_learner, "--actors", count)
+            learner.expect("actors join with")
+            kind = {"per_process": self.per_process, "places": places}
+            swarm = Swarm(at_actors, count, 1e6, self.seconds, "pixels", **kind)
+            try:
+                swarm.await_ready()
+                pids = (learner.process.pid, router.process.pid)
+                before = [cpu_seconds(pid) for pid in pids]
+                swarm.go()
+                time.sleep(0.3 * self.seconds)  # the recording of a GPU's graph is not measured
+                began, first, stages = time.monotonic(), here.status(), _last_line(notes)
+                time.sleep(0.65 * self.seconds)
+                last, took = here.status(), time.monotonic() - began
+                stages = _per_rollout(ENVIRONMENTS * self.rows, stages, _last_line(notes))
+                spent = [(cpu_seconds(pid) - old) / self.seconds for pid, old in zip(pids, before, strict=True)]
+                results = swarm.results()
+            finally:
+                swarm.close()
+        assert first is not None
+        assert last is not None
+        latencies = [latency for result in results for latency in result["latencies"]]
+        acks = " and ".join(f"{1000 * value:.1f}" for value in np.quantile(latencies, (0.5, 0.99)))
+        rate = (last.env_steps - first.env_steps) / took
+        share = "-" if self.limit is None else f"{rate / self.limit:.0%}"
+        lag = "?" if last.policy_lag_mean is None else f"{last.policy_lag_mean:.1f}"
+        shares = [f"{each:.0%}" for each in spent]
+        batch = f"{ENVIRONMENTS * self.rows * self.batch:,}"
+        return str(count), batch, f"{rate:,.0f}", share, acks, lag, *shares, *stages
+
+    def _learner(self, here: Scene, notes: Path, *more: object) -> Running:
+        settings = {
+            "policy.encoder": "nature",
+            "training.algorithm": "impala",
+            "training.batch_rollouts": self.batch,
+            "training.passes": 1,
+            "training.minibatches": 1,
+            "training.device": self.device,
+            "collection.envs_per_actor": ENVIRONMENTS,
+            "collection.rollout_length": self.rows,
+            "service.queue_megabytes": 256,
+        }
+        words = ["pong", *more, "--run-dir", here.folder / "fleet", *ENDLESS]
+        words += [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+        if self.gradients:
+            return here.start("learner", *words)
+        module = [sys.executable, "-m", "benchmarks.fleet.noting_learner", "--no-gradients", notes]
+        return here.run([*map(str, module), *map(str, words)], Path.cwd())
+
+    @contextlib.contextmanager
+    def _network(self, here: Scene) -> Iterator[tuple[Running, str, str, Sequence[Sequence[str]]]]:
+        """Start a router; yield it, its addresses for the learner and for actors, and the places of actors."""
+        if not self.hosts:
+            yield here.router(), here.address, here.address, ((),)
+            return
+        network = Network(here.folder)
         try:
-            swarm.await_ready()
-            pids = (learner.process.pid, router.process.pid)
-            before = [cpu_seconds(pid) for pid in pids]
-            swarm.go()
-            time.sleep(0.3 * seconds)  # the recording of a GPU's graph is not measured
-            began, first = time.monotonic(), here.status()
-            time.sleep(0.65 * seconds)
-            last, took = here.status(), time.monotonic() - began
-            shares = [f"{(cpu_seconds(pid) - old) / seconds:.0%}" for pid, old in zip(pids, before, strict=True)]
-            results = swarm.results()
+            central, *others = [network.host(f"host{number}") for number in range(self.hosts + 1)]
+            # A Unix socket reaches from one namespace into another.
+            here.address, at_actors = f"unixsock-stream/{here.folder / 'router'}", f"tcp/{central.address}:7447"
+            words = ("--listen", here.address, "--listen", at_actors, "--insecure")
+            router = here.run(network.words(central.name, *COMMAND, "router", *words))
+            router.expect("listening")
+            yield router, here.address, at_actors, [network.words(host.name) for host in others]
         finally:
-            swarm.close()
-    assert first is not None
-    assert last is not None
-    latencies = [latency for result in results for latency in result["latencies"]]
-    acks = " and ".join(f"{1000 * value:.1f}" for value in np.quantile(latencies, (0.5, 0.99)))
-    rate = (last.env_steps - first.env_steps) / took
-    lag = "?" if last.policy_lag_mean is None else f"{last.policy_lag_mean:.1f}"
-    return str(count), f"{256 * batch:,}", f"{rate:,.0f}", acks, lag, *shares
+            network.close()
+
+
+STAGES_HEADER = (
+    *(f"{name}, us" for name in ("zenoh", *dict.fromkeys(name for name, _, _ in STAGES), "other", "all")),
+    "rows/s of a core",
+    "cores for 250k rows/s",
+)
+
+
+def _last_line(notes: Path) -> dict[str, float]:
+    """Return what a learner without gradients noted last; empty for another learner."""
+    return json.loads(notes.read_text().splitlines()[-1]) if notes.exists() else {}
+
+
+def _per_rollout(rows: int, before: dict[str, float], after: dict[str, float]) -> tuple[str, ...]:
+    """Return the cells of STAGES_HEADER: CPU microseconds of each stage of a rollout, of all, and what follows."""
+    if not after:
+        return ()
+    spent = {name: after[name] - before.get(name, 0.0) for name in after}
+    rollouts, everything = spent.pop("rollouts"), spent.pop("all")
+    spent |= {"other": everything - sum(spent.values()), "all": everything}
+    cells = [f"{1e6 * spent.get(name.removesuffix(', us'), 0.0) / rollouts:.0f}" for name in STAGES_HEADER[:-2]]
+    rate = rows * rollouts / everything
+    return *cells, f"{rate:,.0f}", f"{250_000 / rate:.2f}"
 
 
 def _snapshots(notes: Path, came: Sequence[Sequence[tuple[int, float]]], began: float, seconds: float) -> dict:
