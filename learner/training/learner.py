@@ -202,8 +202,6 @@ class Learner:
         self._curiosity: Curiosity | None = None
         if spec.curiosity:
             self._curiosity = Curiosity(spec.discount_factor, synchronous=spec.record.synchronous)
-        # Where a batch has one update, the policy does not move far before the values are known.
-        self._begins_values = self._rewards is not None and spec.record.passes_over_batch
         self._ranges, self._reward_name = ConfirmedRanges(), _REWARDS if self._rewards is None else _RETURNS
         self._reward_shares: dict[Rollout, float] = {}  # of the newest batch: with how much of their size they count
         self.far_outside: dict[Upload, str] = {}  # of the newest batch: what was left out, and its component
@@ -251,7 +249,7 @@ class Learner:
         if self._curiosity is not None:
             self._curiosity.look(rollouts, _annealed(self._spec.curiosity, 0.0, progress))
         batch, kept, seen = self._sorted_out(rollouts)
-        if self.policy_version == 0:
+        if self._spec.mean_first_value and self.policy_version == 0:
             self._begin_values(batch)
         with memory_faults(batch.rewards.numel(), lambda: self._fitting(batch)):
             on_device = self.graphs.moved(batch)
@@ -265,11 +263,10 @@ class Learner:
         """Let the values of all states begin as their mean over the first batch, unless weights were loaded.
 
         The mean of V(s) = r + discount_factor V(s') is r / (1 - discount_factor (1 - p)), with the mean reward r, and
-        the share p of the rows that terminate. Where rewards are negative, the usual 0 is more than any state is worth:
-        the policy then goes to states that it has not seen, until their values are known, which takes many batches.
+        the share p of the rows that terminate.
         """
         head, rows = self._network.value_head, batch.valid > 0
-        if not self._begins_values or head is None or float(head.bias.detach()) != 0.0 or not rows.any():
+        if head is None or float(head.bias.detach()) != 0.0 or not rows.any():
             return
         goes_on = 1.0 - float(batch.terminated[rows].float().mean())
         value = float(batch.rewards[rows].mean()) / max(1.0 - self._spec.discount_factor * goes_on, _LEAST_END)
