@@ -16,12 +16,12 @@ from pathlib import Path
 from benchmarks.learner_speed import busy_actors
 from benchmarks.running import machine, table
 from daedalus.launch.supervision import Inference, Supervised, stop, supervised_inference
-from daedalus.transport.private_address import private_folder
+from daedalus.transport.private_address import socket_folder
 
 
 def measure(inference: Inference, actors: int, seconds: float) -> tuple[float, float]:
     """Return the env_steps/s of all actors together, and the microseconds of CPU time of an env_step."""
-    with private_folder() as folder:
+    with socket_folder() as folder:
         processes, options = supervised_inference(inference, folder, ["--log-level", "warning"])
         try:
             with busy_actors(actors, "--encoder", "nature", *options) as ends:

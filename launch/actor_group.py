@@ -19,7 +19,7 @@ from daedalus.launch.supervision import (
     stop,
     supervised_inference,
 )
-from daedalus.transport.private_address import private_folder
+from daedalus.transport.private_address import socket_folder
 
 _logger = logging.getLogger(__name__)
 
@@ -30,7 +30,8 @@ _LEAVE = getattr(signal, "SIGUSR1", None)  # Windows has none
 class ActorGroup:
     """Actors that share a command line, and the process of their policy. An actor that has ended its work stays gone.
 
-    An actor that fails is started again. `leave` lets all of them finish their rollouts.
+    An actor that fails is started again, unless it fails too often: the others then go on without it. `leave` lets all
+    of them finish their rollouts.
     """
 
     def __init__(self, words: Sequence[str], names: Sequence[str], inference: Inference, logs: LogOptions) -> None:
@@ -45,31 +46,32 @@ class ActorGroup:
         self._words, self._names, self._logs = words, names, logs
         self._inference: Inference = inference
         self._actors: list[Supervised] = []
+        self._leave = threading.Event()
+        self._leaving = False  # whether the actors were told
 
     def leave(self, _stop: threading.Event) -> None:
-        """Let the actors finish and upload their rollouts, and end."""
-        for actor in list(self._actors):
-            if _LEAVE is not None and actor.process.poll() is None:
-                os.kill(actor.process.pid, _LEAVE)
+        """Let the actors finish and upload their rollouts, and end; from any thread."""
+        self._leave.set()
 
     def run(self, stopping: threading.Event) -> int:
         """Run the actors until all have ended, or until `stopping`; return the largest of their exit statuses."""
         inference: list[Supervised] = []
         statuses = [0]
-        with private_folder() as folder:
+        with socket_folder() as folder:
             try:
                 inference, shared = supervised_inference(self._inference, folder, self._logs.words())
                 for name in self._names:
                     begin = partial(self._begin, name, shared)
                     self._actors.append(Supervised(name, begin, ended={0}, no_fault={}))
                 while self._actors and not stopping.wait(_POLL_SECONDS):
-                    for process in [*self._actors, *inference]:
-                        status = process.process.poll()
-                        if process in self._actors and (status == 0 or process.failed_at_once):
-                            self._actors.remove(process)  # it has said why
-                            statuses.append(status or 0)
-                        elif message := process.check():
-                            _logger.warning("%s", message)
+                    if self._leave.is_set() and not self._leaving:
+                        self._tell_to_leave()
+                    for actor in list(self._actors):
+                        if (status := self._ended(actor)) is not None:
+                            self._actors.remove(actor)
+                            statuses.append(status)
+                    for each in inference:
+                        _check(each)
             except FailedError as error:
                 print_error("actor", error)
                 statuses.append(FAILED)
@@ -78,7 +80,30 @@ class ActorGroup:
                 stop([each.process for each in inference])
         return max(statuses)
 
+    def _tell_to_leave(self) -> None:
+        self._leaving = True
+        for actor in self._actors:
+            if _LEAVE is not None and actor.process.poll() is None:
+                os.kill(actor.process.pid, _LEAVE)  # which kills one that has just begun to start
+
+    def _ended(self, actor: Supervised) -> int | None:
+        """Return the exit status of an actor that stays gone. Else restart it if it has died, and return None."""
+        status = actor.process.poll()
+        if status is not None and (status == 0 or self._leaving or actor.failed_at_once):
+            return status  # it has said why
+        try:
+            _check(actor)
+        except FailedError as error:
+            print_error("actor", error)
+            return FAILED
+        return None
+
     def _begin(self, name: str, shared: Sequence[str], _first: bool) -> Child:
         words = [*self._words, "--actors", "1", "--inference", "local", "--name", name, *shared]
         with inherited(name) as streams:
             return start("daedalus.cli.commands.actor", *words, streams=streams, one_thread=True)
+
+
+def _check(process: Supervised) -> None:
+    if message := process.check():
+        _logger.warning("%s", message)

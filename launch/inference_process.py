@@ -174,8 +174,8 @@ class Inference:
                     return True
                 case _:
                     raise ValueError(f"unexpected packet {packet[:40]!r}")
-        except (PolicyError, ValueError, TypeError, KeyError, IndexError) as error:
-            actor.answer({"error": message_line(error)[:1000]})
+        except (PolicyError, ValueError, TypeError, LookupError) as error:
+            actor.answer(_refusal(error))
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -209,19 +209,33 @@ class Inference:
             chunks[-1].append(actor)
         for version, chunks in batches.items():
             for actors in chunks:
-                try:
-                    _choose(version.runtime, actors)
-                    answer = {}
-                except PolicyError as error:
-                    answer = {"error": message_line(error)[:1000]}
-                for actor in actors:
-                    actor.answer(answer)
+                _answer(version.runtime, actors)
 
     def _forget(self, actor: _Actor) -> None:
         self._selector.unregister(actor.socket)
         actor.socket.close()
         if actor.policy is not None and actor.version is not None:
             actor.policy.release(actor.version)
+
+
+def _answer(runtime: PolicyRuntime, actors: list[_Actor]) -> None:
+    """Choose the actions of actors with the same weights, and answer them. What fails for one fails for it alone."""
+    answer = {}
+    try:
+        _choose(runtime, actors)
+    except (PolicyError, ValueError, TypeError, LookupError) as error:
+        if len(actors) > 1:
+            for actor in actors:
+                _answer(runtime, [actor])
+            return
+        answer = _refusal(error)
+    for actor in actors:
+        actor.answer(answer)
+
+
+def _refusal(error: Exception) -> dict[str, str]:
+    """Return the answer after an error. As JSON, a character has up to 12 bytes, and a packet PACKET_BYTES."""
+    return {"error": message_line(error)[: PACKET_BYTES // 16]}
 
 
 def _choose(runtime: PolicyRuntime, actors: list[_Actor]) -> None:
@@ -257,7 +271,7 @@ def main() -> int:
     options.add_argument("--log-json", action="store_true")
     parsed = options.parse_args()
     configure_logging(parsed.log_level, as_json=parsed.log_json, process="inference")
-    stop = stop_on_signals(exit_if_stuck=True)
+    stop = stop_on_signals(exit_if_stuck=True, on_leave=lambda _: None)  # it ends after its actors
     if parsed.exit_with_parent:
         exit_with_parent(stop)
     raise_descriptor_limit()  # an actor has three

@@ -37,10 +37,17 @@ def private_address() -> Iterator[str]:
         _logger.warning("this system has no private sockets: every user of this machine can connect to %s", address)
         yield address
         return
+    with socket_folder() as folder:
+        yield socket_address(os.path.join(folder, _NAME))
+
+
+@contextmanager
+def socket_folder() -> Iterator[str]:
+    """Return a private folder in which a Unix socket with a short name has no path that is too long."""
     chosen = os.path.abspath(tempfile.gettempdir())
     longest = os.path.join(chosen, f"{_PREFIX}12345678", _NAME)
-    with private_folder(chosen if is_socket_path(longest) else "/tmp") as folder:  # where its path is not too long
-        yield socket_address(os.path.join(folder, _NAME))
+    with private_folder(chosen if fcntl is None or is_socket_path(longest) else "/tmp") as folder:
+        yield folder
 
 
 @contextmanager

@@ -273,7 +273,7 @@ class SharedRuntime:
             self._stopped_at = min(self._stopped_at, now)
         if now > min(deadline, self._stopped_at + STOP_SECONDS):
             self._disconnect()
-            raise PolicyError(f"{problem} at {self._path}")
+            raise PolicyError(f"{problem} at {self._path}: see its errors, or use --inference local")
 
     def __del__(self) -> None:
         """Let the process forget this actor."""

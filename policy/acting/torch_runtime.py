@@ -32,7 +32,9 @@ class TorchRuntime:
         for name in (spec.encoder, spec.distribution):
             if ":" in name:
                 # The name came over the wire; importing it would execute code that another process chose.
-                raise PolicyError(f"{name!r} is custom code, not imported here: use --runtime onnx")
+                raise PolicyError(
+                    f"{name!r} is custom code, not imported here: use --runtime onnx, and not --inference cuda"
+                )
         torch.set_num_threads(threads)
         self._device = device
         try:

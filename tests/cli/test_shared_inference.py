@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.acting.shared_runtime import Region, Shape, SharedRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import LearningSpec, PolicySpec
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system cannot share a policy")
@@ -51,8 +51,8 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Supe
         stop([process.process])
 
 
-def shared(path: str, *, program: bytes = PROGRAM) -> SharedRuntime:
-    return SharedRuntime(path, {} if program else SETUP, program, SPACES, threading.Event())
+def shared(path: str, *, program: bytes = PROGRAM, spaces: Spaces = SPACES) -> SharedRuntime:
+    return SharedRuntime(path, {} if program else SETUP, program, spaces, threading.Event())
 
 
 def inputs(seed: int, rows: int = ROWS) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
@@ -130,9 +130,37 @@ def test_faulty_requests_are_refused_and_others_served(served: tuple[str, Superv
         actor.load(faulty)
     with pytest.raises(PolicyError, match="finds no GPU"):
         TorchRuntime(LEARNING.policy, SPACES, device="cuda")
-    other = shared(served[0])
-    other.load(weights(1))
-    assert len(act(other, *inputs(1))[0]) == ROWS
+
+
+def test_what_fails_for_one_actor_does_not_fail_for_those_that_share_its_call(served: tuple[str, Supervised]) -> None:
+    """A run whose spaces do not fit its program; a signal for actors that their supervisor sends to all processes."""
+    path, process = served
+    name = "\U0001f600" * 1000  # more than an answer can carry
+    unfit = SPACES.model_copy(update={"actions": {name: DiscreteSpace(counts=(5,))}})
+    actors, chosen = [shared(path), shared(path, spaces=unfit)], []
+    for actor in actors:
+        actor.load(weights(1))
+
+    def play(actor: SharedRuntime) -> None:
+        try:
+            chosen.append(len(act(actor, *inputs(1))[0]))
+        except PolicyError as error:
+            chosen.append(str(error))
+
+    threads = [threading.Thread(target=play, args=(actor,)) for actor in actors]
+    os.kill(process.process.pid, signal.SIGSTOP)
+    try:
+        for thread in threads:
+            thread.start()
+        os.kill(process.process.pid, signal.SIGUSR1)
+    finally:
+        os.kill(process.process.pid, signal.SIGCONT)
+    for thread in threads:
+        thread.join()
+    chose, failed = sorted(map(str, chosen))
+    assert chose == str(ROWS)
+    assert failed.startswith(f"the inference process: 'actions/{name[:100]}")
+    assert process.process.poll() is None
 
 
 @pytest.mark.parametrize("damage", ["cut", "described", "dtype"])
@@ -147,9 +175,12 @@ def test_shared_memory_that_is_not_as_described_is_refused(damage: str) -> None:
 
 
 def test_actors_of_one_command_share_a_policy_and_survive_its_process(
-    start: Start, address: str, tmp_path: Path
+    start: Start, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS, *SLOW)
+    folder = tmp_path / ("too long for a socket" * 5)
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
     group = start(
         *("actor", "--connect", address, "--name", "g", "--actors", 2, "--inference", "shared", *PLAYING_SLOW)
     )
@@ -169,5 +200,37 @@ def test_actors_of_one_command_share_a_policy_and_survive_its_process(
     assert group.wait() == 0, group.output
 
 
+def test_a_group_goes_on_without_an_actor_that_crashes_and_leaves_although_one_just_starts(
+    start: Start, address: str
+) -> None:
+    group = start("actor", "--connect", address, "--name", "g", "--actors", 2)
+
+    crashed: list[int] = []
+    for _ in range(3):
+        crashed.append(child(group, "g.1", crashed))
+        os.kill(crashed[-1], signal.SIGSEGV)
+    group.expect(r"daedalus actor: g.1 failed 3 times: a fault of native code \(signal 11\)")
+    os.kill(child(group, "g.2"), signal.SIGKILL)
+    group.expect("g.2 was killed by signal 9; started again")
+    group.process.send_signal(signal.SIGUSR1)  # which kills an actor that has no handler yet
+    assert group.wait() == 1, group.output
+    assert "started again" not in group.output.rpartition("signal 9; started again")[2]
+
+
+def child(group: Running, name: str, besides: Sequence[int] = ()) -> int:
+    found: list[int] = []
+
+    def find() -> list[int]:
+        pids = set(processes_mentioning(f"\0{name}\0")).difference(besides)
+        found.extend(pid for pid in pids if parent(pid) == group.process.pid)
+        return found
+
+    until(find)
+    return found[0]
+
+
 def parent(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
+    except OSError:  # it has ended
+        return 0
