@@ -27,6 +27,7 @@ from typing import Any, get_args
 import gymnasium
 
 from daedalus.actor.collecting.client_collector import ClientCollector
+from daedalus.actor.collecting.loop_recorder import LoopRecorder
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.actor_config import ActorConfig, LinkChoice, own_name
@@ -98,6 +99,7 @@ class Clock:
 
 
 _REFUSAL_SECONDS = 12.0  # after `timeout`, for the last two queries of the client's thread, if nobody answers them
+_RECORDING_SECONDS = 10.0  # for the last episodes to be written
 _numbers = itertools.count(1)  # of the clients of this process
 
 
@@ -127,6 +129,7 @@ class Client:
         agents: int | None = None,
         seats: Sequence[str] = (),
         turns: bool | None = None,
+        record: str | Path | None = None,
     ) -> None:
         """Join a run, and wait for the first policy.
 
@@ -155,10 +158,14 @@ class Client:
             first match, 2 and 3 the second.
           turns: with seats, whether they act one after the other, so that each action is a step of the game; False:
             they act together, and the actions of one match up to the next one of the same seat are one step.
+          record: a new Minari dataset, for `--demonstrations`: each episode that ends is written into it, with the
+            actions that were played, by the policy or in its place. A folder, which begins with `./`, `/` or `~`, or an
+            id in Minari's local folder.
 
         Raises ValueError for a safe action that is not in the action space, a number of agents that is not from 1 to
         4096 or does not fill whole matches, unfit names of seats, seats without `turns`, another link, or a timeout
-        that is not above 0; ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
+        that is not above 0; DatasetError for a dataset that exists, or without Minari; ActorError, TransportError,
+        EnvironmentSetupError, AddressError or CredentialsError.
         """
         if isinstance(seats, str) or (bool(seats) != (turns is not None)):
             raise ValueError("give both seats, a list of names, and turns, or neither")
@@ -198,6 +205,10 @@ class Client:
             check=self._check,
         )
         self.agents = self._collector.agents
+        self._recorder = None if record is None else LoopRecorder(str(record))
+        if self._recorder is not None:
+            for agent in self.agents:
+                agent.tape = self._recorder.tape(observation_space, action_space)
         self._clocks: list[Clock] = []
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._serve, name="actor", daemon=True)
@@ -270,6 +281,14 @@ class Client:
                 self._thread.join(timeout=10.0)
         finally:  # also after another Ctrl-C
             self._transport.close()
+            self._close_recording()
+
+    def _close_recording(self) -> None:
+        if self._recorder is not None:
+            for agent in self.agents:
+                if agent.tape is not None:
+                    agent.tape.finish()
+            self._recorder.close(_RECORDING_SECONDS)
 
     def _report(self) -> ClientReport:
         """Return what the status shows of this client. Called on the client's thread."""

@@ -2,6 +2,7 @@
 
 import logging
 import zlib
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -19,7 +20,10 @@ _MOST_OBSERVATIONS = 2_000_000  # of all running episodes together, about 200 MB
 _SIZE = 8  # of the set of an episode itself, in observations
 _JUDGED_ROWS = 4096  # the first ones
 _LARGEST = 10.0  # reward at a weight of 1, as that of normalised rewards
-_MOST_NEW = 0.95  # share of first visits, above which observations do not come back
+_EPISODES = 100
+_FEWEST_EPISODES = 20  # whose totals say something
+_DEVIATION = 0.25  # of the totals, below which the reward shrinks
+_MOST_NEW = 0.95  # share of first visits, above which observations do not come back, and nothing is rewarded
 
 _logger = logging.getLogger(__name__)
 
@@ -35,6 +39,7 @@ class FirstVisits:
     def __init__(self, *, synchronous: bool = False) -> None:
         """Construct it. `synchronous`: whether the run makes its actors wait for each update."""
         self._streams = Streams[list[set[int]]](synchronous=synchronous, most=_MOST_OBSERVATIONS)
+        self.totals = deque[int](maxlen=_EPISODES)  # different observations of each of the newest episodes that ended
         self._has_warned = False
 
     def add(self, rollout: Rollout) -> np.ndarray:
@@ -52,6 +57,7 @@ class FirstVisits:
             for row in range(rollout.rows):
                 code = codes[row + 1][environment]
                 if not rollout.valid[row, environment]:  # the next observation is the first of another episode
+                    self.totals.append(len(known))
                     known.clear()
                 elif code not in known:
                     first[row, environment] = 1.0
@@ -81,12 +87,15 @@ def _codes(rollout: Rollout) -> list[list[int]]:
 class Curiosity:
     """Rewards for first visits, which the learner adds to those of the environment.
 
-        b_t = w min(1 / d, 10) if s_{t+1} is new in its episode, else 0
+        b_t = w min(1 / d, 10) min(4 v, 1) if s_{t+1} is new in its episode, else 0
 
-    with a weight w, and d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for
-    the rewards of the environment (RewardNormalizer). Where each episode has another map, this term alone explores as
+    with a weight w, d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for the
+    rewards of the environment (RewardNormalizer), and v the deviation of the number of different observations of an
+    episode, over the newest 100: where all episodes have equally many, no way to act finds more, and their order is
+    noise that hides the rewards of the environment. Where each episode has another map, this term alone explores as
     well as together with the prediction errors that it was added to at first: Wang et al. (2023), "Revisiting Intrinsic
-    Reward for Exploration in Procedurally Generated Environments".
+    Reward for Exploration in Procedurally Generated Environments". Where nearly every observation is new, the term
+    would reward long episodes alone: after the first rows it is 0 for good.
     """
 
     def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:
@@ -96,6 +105,7 @@ class Curiosity:
         self._newest: dict[Rollout, np.ndarray] = {}  # first visits of the newest batch
         self._factor = 0.0  # of the newest batch
         self._rows = self._new = 0  # among the first rows; it has judged them if there are enough
+        self._rewards = True
 
     @property
     def statistics(self) -> dict[str, Tensor]:
@@ -107,9 +117,9 @@ class Curiosity:
         self._newest = {each: self._visits.add(each) for each in rollouts}
         counted = [replace(each, rewards=first) for each, first in self._newest.items()]
         self._scale.moments.merge(self._scale.moments_of(counted))
-        self._factor = weight * min(1.0 / self._scale.divisor, _LARGEST)
         if self._rows < _JUDGED_ROWS:
             self._judge()
+        self._factor = weight * min(1.0 / self._scale.divisor, _LARGEST) * self._choice() if self._rewards else 0.0
 
     def add_to(self, batch: Batch, rollouts: Sequence[Rollout]) -> None:
         """Add the rewards of rollouts to those of their batch in place. Rollouts not looked at have none."""
@@ -127,14 +137,20 @@ class Curiosity:
         share = float(np.concatenate(learned).mean())
         return dict(zip(METRICS, (share, share * self._factor), strict=True))
 
+    def _choice(self) -> float:
+        """Return the part of the reward that is given, from 0 to 1: how much the episodes differ in what they find."""
+        totals = self._visits.totals
+        return min(float(np.std(totals)) / _DEVIATION, 1.0) if len(totals) >= _FEWEST_EPISODES else 1.0
+
     def _judge(self) -> None:
-        """Warn once, after enough rows, if observations do not come back."""
+        """Stop rewarding, after enough rows, if observations do not come back."""
         self._rows += sum(int(each.learned.sum()) for each in self._newest)
         self._new += sum(int(first[each.learned].sum()) for each, first in self._newest.items())
         if self._rows >= _JUDGED_ROWS and self._new > _MOST_NEW * self._rows:
+            self._rewards = False
             _logger.warning(
-                "training.curiosity hardly tells rows apart: %.0f %% of them lead to an observation that is new in its "
-                "episode, so that it rewards little but long episodes. Set training.curiosity=0, or let "
-                "environment.wrap round the observations or leave out what always changes, such as a clock",
+                "training.curiosity stops: %.0f %% of the rows lead to an observation that is new in its episode, so "
+                "that it would reward little but long episodes. To keep it, let environment.wrap round the "
+                "observations or leave out what always changes, such as a clock",
                 100.0 * self._new / self._rows,
             )

@@ -17,8 +17,8 @@ from daedalus.algorithms.forward import FlatParameters
 from daedalus.algorithms.recording import OperationRecorder
 from daedalus.algorithms.replay_buffer import Transitions
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.encoders import build_encoder
-from daedalus.policy.network.layers import Components
+from daedalus.policy.network.encoders import build_encoder, image_encoders
+from daedalus.policy.network.layers import Components, map_components
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import Spaces
@@ -26,7 +26,10 @@ from daedalus.protocol.spec import PolicySpec
 
 
 class TwinCritics(nn.Module):
-    """Two critics Q_1(s, a) and Q_2(s, a) with layers of their own, computed at once, and one encoder of images."""
+    """Two critics Q_1(s, a) and Q_2(s, a) with layers of their own, computed at once, and one encoder of images.
+
+    The convolutions of images are the critics': the policy has a copy of them.
+    """
 
     def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules) -> None:
         """Construct both. The layers have the sizes of `policy.hidden`; see `build_encoder` for the exceptions."""
@@ -41,8 +44,13 @@ class TwinCritics(nn.Module):
         self.biases = nn.ParameterList([_uniform(inputs, (2, 1, outputs)) for inputs, outputs in pairs])
         self._activate = torch.relu if spec.activation == "relu" else torch.tanh
 
+    def convolve(self, prepared: Components) -> Components:
+        """Return observations, with each image shifted at random and replaced by the outputs of its convolutions."""
+        encoders = image_encoders(self.encoder)
+        return prepared | {name: encoder.convolve(prepared[name], shifted=True) for name, encoder in encoders.items()}
+
     def forward(self, prepared: Components, actions: Tensor) -> Tensor:
-        """Return both values [2, B] of actions [B, D] in observations, each [B, *stacked_shape]."""
+        """Return both values [2, B] of actions [B, D] in observations, each [B, *stacked_shape] or convolved."""
         features = torch.cat([self.encoder(prepared).float(), actions], -1)
         hidden = features.expand(2, *features.shape)
         *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
@@ -90,6 +98,14 @@ class Sac(Algorithm):
         self._target_critics = copy.deepcopy(self._critics).requires_grad_(False)
         self._flat = FlatParameters(self._critics.parameters())
         self._targets = FlatParameters(self._target_critics.parameters()).values
+        self._convolutions = [
+            (part.convolutions, of_critics.convolutions, of_targets.convolutions)
+            for part, of_critics, of_targets in zip(
+                *(image_encoders(each.encoder).values() for each in (network, critics, self._target_critics)),
+                strict=True,
+            )
+        ]
+        self.take_convolutions()
         self._log_temperature = torch.zeros(1, device=device)
         self._actions = self.distribution.normal_count  # D
         self._target_rate, self._is_mixed = target_rate, is_mixed
@@ -98,6 +114,12 @@ class Sac(Algorithm):
         # What optimisers change, besides the policy.
         self.learned = {"critics": self._flat.values, "log_temperature": self._log_temperature}
         self.statistics = {**self.learned, "target_critics": self._targets}
+
+    def take_convolutions(self) -> None:
+        """Give the critics and their targets the convolutions of the policy."""
+        for of_policy, *others in self._convolutions:
+            for each in others:
+                _copy(of_policy, each)
 
     @property
     def temperature(self) -> float:
@@ -133,12 +155,14 @@ class Sac(Algorithm):
         now, then = self._network.prepare(now), self._network.prepare(then)
         with self._precision():
             with torch.no_grad():
-                next_actions, next_log_probs = self._choose(then, noise[rows:])
-                next_values = self._target_critics(then, next_actions).amin(0) - temperature * next_log_probs
-                targets = rewards + discounts * next_values
+                next_actions, next_log_probs = self._choose(self._critics.convolve(then), noise[rows:])
+                next_values = self._target_critics(self._target_critics.convolve(then), next_actions).amin(0)
+                targets = rewards + discounts * (next_values - temperature * next_log_probs)
+            now = self._critics.convolve(now)
             values = self._critics(now, actions)  # [2, B]
             value_loss = 0.5 * (values - targets).square().mean(-1).sum()
             critic_gradient = self._flat.differentiated(value_loss)
+            now = map_components(now, Tensor.detach)  # the policy does not change the convolutions
             chosen, log_probs = self._choose(now, noise[:rows])
             first, second = self._critics(now, chosen).unbind()
             policy_loss = (temperature * log_probs - torch.minimum(first, second)).mean()
@@ -163,3 +187,11 @@ class Sac(Algorithm):
     def after_update(self, policy_version: int, forward: Forward) -> None:
         """See Algorithm: move the target critics by `target_rate` of the way to the critics."""
         self._targets.lerp_(self._flat.values, self._target_rate)
+        for of_policy, of_critics, _ in self._convolutions:
+            _copy(of_critics, of_policy)
+
+
+def _copy(source: nn.Module, target: nn.Module) -> None:
+    with torch.no_grad():
+        for parameter, values in zip(target.parameters(), source.parameters(), strict=True):
+            parameter.copy_(values)

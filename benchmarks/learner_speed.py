@@ -88,9 +88,10 @@ def _durations(update: Callable[[], None], seconds: float) -> list[float]:
 
 
 @contextlib.contextmanager
-def busy_actors(count: int) -> Iterator[None]:
-    """Run `count` processes that play Pong."""
-    command = [sys.executable, str(Path(__file__).parent / "busy_actor.py")]
+def busy_actors(count: int, *options: str) -> Iterator[list[tuple[float, ...]]]:
+    """Run `count` processes that play Pong. Yield a list, which has what each printed at its end after the block."""
+    command = [sys.executable, str(Path(__file__).parent / "busy_actor.py"), *options]
+    ends: list[tuple[float, ...]] = []
     actors: list[subprocess.Popen[bytes]] = []
     try:
         for _ in range(count):
@@ -98,10 +99,13 @@ def busy_actors(count: int) -> Iterator[None]:
         for actor in actors:
             if actor.stdout is None or actor.stdout.readline() != b"busy\n":
                 raise SystemExit("an actor process failed: see its error message above")
-        yield
+        yield ends
     finally:
         for actor in actors:
-            actor.communicate()  # closes its standard input, which ends it
+            if actor.stdin is not None:
+                actor.stdin.close()  # which ends it
+                actor.stdin = None  # as `communicate` requires
+        ends += [tuple(map(float, actor.communicate()[0].split())) for actor in actors]
 
 
 def beside(update: Callable[[], None], threads: int, actors: int, seconds: float) -> tuple[float, float]:

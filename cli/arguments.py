@@ -6,8 +6,10 @@ import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 from daedalus.launch.logs import LEVELS, LogOptions
+from daedalus.launch.supervision import Inference
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_words
 
 
@@ -79,6 +81,17 @@ def add_insecure(options: argparse._ActionsContainer) -> None:
         action="store_true",
         help="allow an address that other hosts can reach without TLS. Every host that reaches it may take part, and "
         "traffic is not encrypted",
+    )
+
+
+def add_inference(options: argparse._ActionsContainer) -> None:
+    """Add --inference."""
+    options.add_argument(
+        "--inference",
+        choices=get_args(Inference),
+        default="local",
+        help="where the policies of the actors run. local: in each actor; shared: in one process for all of them, on "
+        "half of the cores; cuda: in one process on the GPU, with torch (default: %(default)s)",
     )
 
 

@@ -1,12 +1,23 @@
-"""A robot with its own clock, behind a bad network: `python examples/robot.py tcp/127.0.0.1:7447`.
+"""A robot with its own clock, behind a bad network, learns to put a peg into a hole from a few examples and some help.
 
-Start the learner in another terminal, on any machine:
-    daedalus learner --env Arm --algorithm appo --actors 1 --set collection.rollout_length=50 \
-        --set training.batch_rollouts=2 --set training.discount_factor=0.9 --set training.entropy_bonus=0
+In the folder `examples`, show it ten times, and start the learner, on any machine:
 
-Three processes: the learner, the simulated arm with a loop of 50 Hz, and a proxy between them that delays what it
-forwards, one piece in a hundred by more than 200 ms. The arm learns to turn its joints to targets. It never waits for
-the network: the program prints how many of its deadlines it missed.
+    daedalus record --env robot:Arm --by robot:Person --episodes 10 --out ./shown
+    daedalus learner --env robot:Arm --algorithm sac --demonstrations ./shown --actors 1 \
+        --set training.updates_per_env_step=2 --set training.n_step=5 --set training.discount_factor=0.98 \
+        --set policy.hidden=[64,64] --set training.minibatch_rows=128 --set training.learning_rate=1e-3 \
+        --set training.replay_begin=200
+
+In another terminal:
+
+    python robot.py tcp/127.0.0.1:7447
+
+The only reward is that of success, which random motions never reach. Whoever watches the arm takes over where it has
+not succeeded after a second, ever less often. Between the arm and the learner is a proxy that delays what it
+forwards, one piece in a hundred by more than 200 ms, and cuts all connections every 30 seconds. The arm never waits for
+the network: the program prints how many of its deadlines of 50 Hz it missed.
+
+With `robot:Camera`, and `--camera` of this program, the arm sees a picture in place of numbers.
 """
 
 import argparse
@@ -17,6 +28,7 @@ import math
 import multiprocessing
 import signal
 import time
+from collections import deque
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -27,75 +39,141 @@ from daedalus import Client
 
 RATE = 50.0  # ticks a second
 EPISODE = 100  # ticks: two seconds
+PATIENCE = 50  # ticks before somebody helps
+HALF_WIDTH, DEPTH = 0.02, 0.08  # of the hole, in metres
+SPEED = 0.5  # metres a second
+REWARD = 100.0  # of success
+SIDE, HIGH = 48, 38  # pixels of a picture, and those above the plate
+PIXEL = 0.0125  # metres
+CUT_SECONDS = 30.0  # between cuts of the network
 
 
-class Arm:
-    """Two joints that follow commanded speeds, to be turned to target angles."""
+class Arm(gymnasium.Env):
+    """An arm that moves a peg above a plate with a hole, at commanded speeds, and stops where it hits the plate."""
 
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+    observation_space: gymnasium.Space = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Lift the peg; the hole is somewhere else."""
+        super().reset(seed=seed)
+        self.hole = self.np_random.uniform(-0.2, 0.2)
+        self.peg = np.array([self.np_random.uniform(-0.2, 0.2), 0.35])  # its tip, to the right and above the plate
+        self.speeds, self.ticks = np.zeros(2), 0
+        return self.look(), {}
+
+    def look(self) -> np.ndarray:
+        """Return where the tip is, from the hole, and how fast it moves."""
+        return np.array([self.peg[0] - self.hole, self.peg[1], *self.speeds], np.float32)
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Move for one tick. The episode ends when the peg is in the hole or hits the plate, or after two seconds."""
+        self.ticks += 1
+        self.speeds += 0.5 * (SPEED * np.clip(action, -1.0, 1.0) - self.speeds)
+        inside = self.peg[1] < 0.0
+        self.peg = np.clip(self.peg + self.speeds / RATE, [-0.28, -DEPTH], [0.28, 0.4])
+        if inside:
+            self.peg[0] = np.clip(self.peg[0], self.hole - HALF_WIDTH, self.hole + HALF_WIDTH)
+        success = bool(self.peg[1] <= -DEPTH)
+        hits = self.peg[1] < 0.0 and bool(abs(self.peg[0] - self.hole) > HALF_WIDTH)
+        over = success or hits
+        return self.look(), REWARD * success, over, self.ticks >= EPISODE and not over, {}
+
+
+class Camera(Arm):
+    """The same arm, seen as a picture: the peg is white, the plate grey."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 1), np.uint8)
+
+    def look(self) -> np.ndarray:
+        """Return the picture."""
+        pixels = np.arange(SIDE)
+        row, column, hole = HIGH - self.peg[1] / PIXEL, SIDE / 2 + self.peg[0] / PIXEL, SIDE / 2 + self.hole / PIXEL
+        peg = np.outer(_covered(pixels, row - 4.0, 4.0), _covered(pixels, column, 1.0))
+        plate = np.outer(pixels >= HIGH, 1.0 - _covered(pixels, hole, HALF_WIDTH / PIXEL))
+        return np.maximum(255.0 * peg, 96.0 * plate).astype(np.uint8)[..., None]
+
+
+def _covered(pixels: np.ndarray, centre: float, half: float) -> np.ndarray:
+    """Return how much of each pixel is covered from `centre` - `half` to `centre` + `half`."""
+    return np.clip(half + 0.5 - np.abs(pixels - centre), 0.0, 1.0)
+
+
+class Person:
+    """Who shows the task, and helps: goes above the hole, then down, a little shakily."""
 
     def __init__(self) -> None:
         self._random = np.random.default_rng()
-        self._errors, self._speeds = np.zeros(2), np.zeros(2)
 
-    def new_target(self) -> None:
-        """Choose angles that the joints shall turn by."""
-        self._errors = self._random.choice([-1.0, 1.0], 2) * self._random.uniform(0.5, 1.5, 2)
+    def reset(self, agent: str, seed: int) -> None:
+        """Begin an episode."""
+        self._random = np.random.default_rng(seed)
 
-    def look(self) -> np.ndarray:
-        """Return how far each joint is from its target, in radians, and how fast it turns."""
-        return np.concatenate([self._errors, self._speeds]).astype(np.float32)
+    def act(self, observation: np.ndarray, action_mask: Any = None) -> np.ndarray:
+        """Return the action for what the arm or the camera sees."""
+        if observation.ndim == 1:
+            aside, height = observation[:2]
+        else:
+            white, grey = observation[..., 0] > 96, observation[-1, :, 0]
+            rows, columns = np.nonzero(white)
+            aside = PIXEL * (columns.mean() - np.average(np.arange(SIDE), weights=96 - np.minimum(grey, 96)))
+            height = PIXEL * (HIGH - rows.max())
+        over = abs(aside) < HALF_WIDTH / 2 or height < 0.0
+        wanted = np.array([-10.0 * aside, -1.0 if over else 5.0 * (0.1 - height)])
+        return np.clip(wanted + self._random.normal(0.0, 0.1, 2), -1.0, 1.0).astype(np.float32)
 
-    def move(self, action: np.ndarray) -> float:
-        """Move for one tick; return the reward: minus the mean distance of the joints from their targets."""
-        self._speeds += 0.5 * (3.0 * np.clip(action, -1.0, 1.0) - self._speeds)
-        self._errors -= self._speeds / RATE
-        return -float(np.abs(self._errors).mean())
 
-
-def drive(address: str, seconds: float, results: Connection) -> None:
+def drive(address: str, options: argparse.Namespace, results: Connection) -> None:
     """Run the arm's loop, in a process of its own."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    arm = Arm()
+    arm, person = Camera() if options.camera else Arm(), Person()
     client = Client(
         address,
         observation_space=arm.observation_space,
         action_space=arm.action_space,
         name="arm",
-        safe_action=np.zeros(2, np.float32),  # the joints stop
+        safe_action=np.zeros(2, np.float32),  # the peg stops
         max_policy_age=30.0,
         untrained=True,  # the arm may learn from the beginning
     )
-    last = int(seconds * RATE)
+    alone: deque[bool] = deque(maxlen=20)  # of the newest episodes without help, which succeeded
+    episodes, helped = 0, 0
+    last, random = int(options.seconds * RATE), np.random.default_rng()
     with client, client.clock(RATE) as clock:
-        total, returns = 0.0, []
-        arm.new_target()
-        for tick in range(last):
-            if not clock.wait():
-                break
-            if tick and tick % EPISODE == 0:
-                client.end_episode(terminated=False, observation=arm.look())
-                returns.append(total)
-                total = 0.0
-                arm.new_target()
-                if len(returns) % 10 == 0:
-                    print(
-                        f"{clock.deadlines:,} deadlines, {clock.missed_deadlines:,} missed; the last episodes "
-                        f"returned {np.mean(returns[-10:]):.1f}; {client.safe_reason or 'the policy acts'}",
-                        flush=True,
-                    )
-            reward = arm.move(client.act(arm.look()))
-            client.reward(reward)
-            total += reward
-        results.send({"deadlines": clock.deadlines, "missed": clock.missed_deadlines, "returns": returns})
+        observation, _ = arm.reset()
+        watched = not options.no_help
+        while clock.wait() and clock.deadlines < last:
+            helps = watched and arm.ticks >= PATIENCE
+            action = client.act(observation, override=person.act(observation) if helps else None)
+            observation, reward, is_over, is_late, _ = arm.step(action)
+            if not (is_over or is_late):
+                continue
+            if success := reward > 0.0:
+                client.success(REWARD, observation)
+            else:
+                client.end_episode(terminated=is_over, observation=observation)
+            episodes, helped = episodes + 1, helped + helps
+            if not helps:
+                alone.append(success)
+            if episodes % 20 == 0:
+                print(
+                    f"{clock.deadlines:,} deadlines, {clock.missed_deadlines:,} missed; {episodes} episodes, {helped} "
+                    f"with help; {sum(alone)} of the last {len(alone)} without succeeded; "
+                    f"{client.safe_reason or 'the policy acts'}",
+                    flush=True,
+                )
+            observation, _ = arm.reset()
+            # Whoever watches the arm looks away ever more often: an episode without help shows what it can do.
+            watched = not options.no_help and random.random() < 0.5 * (1.0 - np.mean(alone or [0.0]))
+        results.send({"deadlines": clock.deadlines, "missed": clock.missed_deadlines, "alone": [*alone]})
 
 
 class DelayingProxy:
-    """Forwards TCP connections. It delays each piece at random and keeps the order."""
+    """Forwards TCP connections. It delays each piece at random, keeps the order, and cuts all connections at times."""
 
     def __init__(self, target: str, p99: float) -> None:
         """`target` is HOST:PORT; `p99` the delay in seconds that one piece in a hundred exceeds."""
+        self._open: set[asyncio.StreamWriter] = set()
         self._target, self._mean = target.rsplit(":", 1), p99 / math.log(100.0)  # of an exponential distribution
         self._random = np.random.default_rng()
         self.delays: list[float] = []  # as they were, in seconds
@@ -105,7 +183,10 @@ class DelayingProxy:
         server = await asyncio.start_server(self._connect, "127.0.0.1", 0)
         started.send(server.sockets[0].getsockname()[1])
         async with server:
-            await server.serve_forever()
+            while True:
+                await asyncio.sleep(CUT_SECONDS)
+                for each in self._open:
+                    each.close()
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
@@ -113,8 +194,10 @@ class DelayingProxy:
         except OSError:  # there is no learner yet: the client tries again
             writer.close()
             return
+        self._open |= {writer, far_writer}
         with contextlib.suppress(asyncio.CancelledError, ConnectionError):  # the end of the program or of a connection
             await asyncio.gather(self._forward(reader, far_writer), self._forward(far_reader, writer))
+        self._open -= {writer, far_writer}
 
     async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         pieces: asyncio.Queue[tuple[float, float, bytes]] = asyncio.Queue()
@@ -153,7 +236,9 @@ def delay_network(target: str, p99: float, pipe: Connection) -> None:
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("address", nargs="?", default="tcp/127.0.0.1:7447", help="default: %(default)s")
-    options.add_argument("--seconds", type=float, default=200.0, help="of driving (default: %(default)s)")
+    options.add_argument("--seconds", type=float, default=300.0, help="of driving (default: %(default)s)")
+    options.add_argument("--camera", action="store_true", help="the arm sees a picture")
+    options.add_argument("--no-help", action="store_true", help="nobody takes over")
     options.add_argument(
         "--delay-p99", type=float, default=0.2, metavar="SECONDS", help="one piece in a hundred (default: %(default)s)"
     )
@@ -165,7 +250,7 @@ def main() -> None:
     proxy: Any = processes.Process(target=delay_network, args=(target, parsed.delay_p99, proxys_pipe), daemon=True)
     proxy.start()
     address = f"tcp/127.0.0.1:{pipe.recv()}"
-    arm: Any = processes.Process(target=drive, args=(address, parsed.seconds, arms_results), daemon=True)
+    arm: Any = processes.Process(target=drive, args=(address, parsed, arms_results), daemon=True)
     arm.start()
     arms_results.close()
     try:
@@ -177,7 +262,8 @@ def main() -> None:
     delays = np.array(pipe.recv())
     print(
         f"{found['missed']:,} of {found['deadlines']:,} deadlines missed; delays of the network: "
-        f"median {1000 * np.median(delays):.0f} ms, p99 {1000 * np.percentile(delays, 99):.0f} ms, each way"
+        f"median {1000 * np.median(delays):.0f} ms, p99 {1000 * np.percentile(delays, 99):.0f} ms, each way; "
+        f"{sum(found['alone'])} of the last {len(found['alone'])} episodes without help succeeded"
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
 from daedalus.actor.collecting.client_seats import MatchSeat, seated_space
+from daedalus.actor.collecting.loop_recorder import EpisodeTape
 from daedalus.actor.collecting.rollout_writer import RowInputs
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import mask_of_one
@@ -43,6 +44,8 @@ class ClientActor:
         # The action that is played in the row that has begun, in place of the policy's: as it came, and as gymnasium
         # has it.
         self._override = self._played = None
+        self.tape: EpisodeTape | None = None  # records the episodes, if somebody asked for it
+        self._seen: Any = None  # the observation of that row, as gymnasium has it
 
     @property
     def name(self) -> str:
@@ -116,6 +119,9 @@ class ClientActor:
         if begins:
             self._begin(rows, current)
         self._on_action, self._override, self._played = on_action, message.override, played
+        if self.tape is not None:
+            self.tape.reward(message.reward)
+            self._seen = values
 
     def _begins(self, current: PolicyVersion) -> bool:
         """Whether rows for the learner epoch of a policy begin. The unfinished rollout of others is dropped."""
@@ -180,8 +186,11 @@ class ClientActor:
         if not self.rows.take_choice(choice):
             return False
         self.uploads.rows += 1
+        played = self.rows.env_action(choice.actions) if self._override is None else self._played
+        if self.tape is not None:
+            self.tape.act(self._seen, played)
         if self._override is None:
-            self._on_action(self.spaces.action(self.rows.env_action(choice.actions)))
+            self._on_action(self.spaces.action(played))
         else:
             self.uploads.overridden_actions += 1
             self._on_action(self._override)
@@ -196,6 +205,8 @@ class ClientActor:
             self.rows.reward(value)
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
+        if self.tape is not None:
+            self.tape.reward(value)
 
     def end_episode(self, message: EndEpisode) -> None:
         """End the episode. Raises ClientError if the message does not fit; nothing has changed then."""
@@ -203,18 +214,26 @@ class ClientActor:
             raise ClientError("misfit", "a truncated episode needs its last observation for the bootstrap value")
         values = None if message.observation is None else self.spaces.observation(message.observation)
         if self._rows is None or not self._rows.in_episode:
+            if self.tape is not None:
+                self.tape.drop()
             return  # another learner has come since the last action, whose row is dropped
         try:
             self._rows.end_episode(values, terminated=message.terminated, reward=message.reward)
             self._rows.complete_episode()
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
+        if self.tape is not None:
+            self.tape.reward(message.reward)
+            self.tape.end(values, terminated=message.terminated)
+            self.tape.finish()
 
     def cut(self) -> None:
         """End the episode as truncated: the client disconnected."""
         self._on_action = _ignore
         if self._rows is not None:
             self._rows.cut()
+        if self.tape is not None:
+            self.tape.drop()
 
     def release(self) -> None:
         """Let go of the policy version: this actor will not act again."""

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from daedalus.actor.collecting.loop_recorder import LoopRecorder
 from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
@@ -37,6 +38,7 @@ class GatewayConfig:
     name: str  # of its own requests; it is no actor
     owner: str = ""  # the name in its certificate: clients are OWNER.NAME to the learner; empty without a certificate
     run: str = keys.ANY_RUN
+    record: str = ""  # the dataset of the clients' episodes; empty: none
 
     def actor_name(self, client: str) -> str:
         """Return the name of a client towards the learner. Raises ClientError if there is none."""
@@ -111,7 +113,10 @@ class Gateway:
           transport: the network; the caller closes it.
           config: settings.
           on_failure: called on the event loop with a fault of ours: the gateway cannot go on.
+
+        Raises DatasetError if the dataset exists, or Minari is not installed.
         """
+        self._recorder = LoopRecorder(config.record) if config.record else None
         self._transport, self._config, self._on_failure = transport, config, on_failure
         self._loop = asyncio.get_running_loop()
         self._stop = threading.Event()
@@ -158,6 +163,8 @@ class Gateway:
                 self._thread.join(_LINK_SECONDS)
         finally:
             self._sender.close(_SENDER_SECONDS)  # the clients' last rollouts may have come meanwhile
+            if self._recorder is not None:
+                self._recorder.close(_LINK_SECONDS)
 
     @property
     def newest_policy(self) -> NewestPolicy | None:
@@ -225,7 +232,10 @@ class Gateway:
         origin = Origin(host=self._origin.host, software=self._origin.software, address=address)
         join = Join(actor=name, incarnation=secrets.randbits(62), origin=origin)
         uploads = ClientUploads(join, self._sender, self._link_session.heard, self._outbox.add)
-        return ClientActor(join, spaces, uploads)
+        actor = ClientActor(join, spaces, uploads)
+        if self._recorder is not None:
+            actor.tape = self._recorder.tape(spaces.observation_space, spaces.action_space)
+        return actor
 
     async def _enter(self, seat: Seat) -> None:
         """Join the learner, and wait for a policy of it."""

@@ -55,6 +55,7 @@ class GatewaySettings:
     origins: list[str] = field(default_factory=list)  # of pages that may connect
     operator_token: OperatorToken | None = None
     takes_clients: bool = True  # or the page only
+    record: str = ""  # the dataset of the clients' episodes
     other_runs: Callable[[], list[OtherRun]] = lambda: []
     read_folder: ReadFolder = lambda run: None
     camera: tuple[str, ...] | None = None  # command of the camera's process; None: no camera
@@ -79,7 +80,7 @@ class GatewayService:
         self._transports = ExitStack()
         owner = settings.credentials.name if settings.credentials else ""
         name = f"{owner or 'gateway'}.gateway-{os.getpid()}"
-        self._config = GatewayConfig(name=name, owner=owner, run=settings.run)
+        self._config = GatewayConfig(name=name, owner=owner, run=settings.run, record=settings.record)
 
     async def run(self, listener: socket.socket) -> None:
         """Serve until `stop` is set. Raises what makes the gateway fail."""

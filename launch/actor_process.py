@@ -65,6 +65,7 @@ class ActorOptions:
     seats: Sequence[tuple[str, str]] = ()  # roles or agents, each with its run; empty: all seats are of `run`
     environments: int | None = None  # None: as the learner asks
     runtime: Literal["onnx", "torch"] = "onnx"
+    inference_at: str | None = None  # Unix socket of the process that runs the policy
     link: Literal["auto", "lan", "wan"] = "auto"
     timeout: float | None = None
     allowed_modules: frozenset[str] = frozenset()
@@ -87,6 +88,7 @@ class ActorOptions:
             run=run_for(credentials, self.run),
             environments=self.environments,
             runtime=self.runtime,
+            inference=self.inference_at,
             modules=UserModules(self.allowed_modules, "the learner"),
             # Between processes of one machine, only a busy processor is slow.
             link="lan" if self.link == "auto" and all(map(socket_path, self.connect)) else self.link,

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from daedalus.actor.environments.minari_files import DatasetError, new_dataset_folder
 from daedalus.actor.errors import ActorError
 from daedalus.gateway.security import OperatorToken
 from daedalus.gateway.watching.page_data import OtherRun
@@ -66,6 +67,7 @@ class GatewayOptions:
     run_directory: Path | None = None  # of the run, for what the page shows of it
     allowed_modules: Sequence[str] = ()
     takes_clients: bool = True
+    record: str = ""  # the dataset of the clients' episodes
     for_a_person: bool = False  # print the address of the page for the person who started the run
 
 
@@ -137,6 +139,8 @@ def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
         try:
             if options.run != keys.ANY_RUN:
                 keys.check_name(options.run, "run")
+            if options.record:
+                new_dataset_folder(options.record)
             chosen = _Chosen.of(options)
             options = replace(options, run=run_for(chosen.operator, run_for(chosen.credentials, options.run)))
             host, port = _listening_address(options.listen, chosen.serving is not None, options.insecure)
@@ -144,7 +148,7 @@ def run_gateway(options: GatewayOptions, stop: threading.Event) -> int:
         except NotValidNowError as error:
             if retries.wait(str(error)):
                 return 0
-        except (ValueError, OSError, *SECURITY_ERRORS) as error:
+        except (ValueError, OSError, DatasetError, *SECURITY_ERRORS) as error:
             print_error("gateway", error)
             return BAD_USAGE
     if chosen.serving is not None:
@@ -205,6 +209,7 @@ async def _serve(options: GatewayOptions, chosen: "_Chosen", listener: socket.so
         camera=_playing(options, "camera_process", *values),
         match=_playing(options, "match_process"),
         takes_clients=options.takes_clients,
+        record=options.record,
         announce=_announce(options.operator_token) if options.for_a_person else None,
     )
     await GatewayService(settings, stop).run(listener)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.launch.logs import LogOptions
-from daedalus.launch.supervision import Child, StartPlayer, start
+from daedalus.launch.supervision import Child, Inference, StartPlayer, start
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spaces import Spaces
@@ -71,6 +71,7 @@ class LocalRun:
     trained: int | None = None  # exit status of a run that is already trained and that only lacks its evaluation
     spaces: Spaces | None = None  # of the environment, if it was checked
     init_from: Path | None = None  # another run, whose weights the learner begins with
+    inference: Inference = "local"  # where the policies of the actors run
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
     insecure: bool = False

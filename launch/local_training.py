@@ -24,6 +24,7 @@ from daedalus.launch.local_run import (
 from daedalus.launch.process_lifecycle import FAILED, ORDERED, SUPERSEDED, UNSAVED
 from daedalus.launch.supervision import (
     GATEWAY,
+    INFERENCE,
     LEARNER_GRACE_SECONDS,
     Child,
     FailedError,
@@ -34,6 +35,7 @@ from daedalus.launch.supervision import (
     stop,
     supervised_actor,
     supervised_gateway,
+    supervised_inference,
 )
 from daedalus.launch.tracker_processes import TrackerProcesses
 from daedalus.learner.league.versions import VersionFolder
@@ -45,6 +47,7 @@ from daedalus.policy.saving.saved_policy import candidates
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.league import version_name
 from daedalus.protocol.texts import one_line
+from daedalus.transport.addresses import socket_path
 from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)
@@ -78,10 +81,13 @@ def train(
         spec, options = run.spec, actor_arguments(run)
         learner = supervised_learner(run, address, learner_streams)
         actors: list[Supervised] = []
+        inference: list[Supervised] = []
         try:
+            folder = os.path.dirname(socket_path(address) or "")
+            inference, shared = supervised_inference(run.inference, folder, helper_log_words(run.logs), output.pipes)
             # One by one: if one cannot be started, those before it are stopped.
             for index in range(spec.collection.actors):
-                actors.append(player(f"actor-{index}", address, options))
+                actors.append(player(f"actor-{index}", address, (*options, *shared)))
             training = spec.training
             _logger.info(
                 "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
@@ -103,10 +109,11 @@ def train(
             if run.watch:
                 page.append(supervised_gateway(address, gateway_arguments(run), output.pipes))
             trackers.start()
-            return watch(learner, [*actors, *page], run, stopping)
+            return watch(learner, [*actors, *inference, *page], run, stopping)
         finally:
             ask_to_end(learner.process)
             stop([actor.process for actor in actors])
+            stop([each.process for each in inference])
             stop([learner.process], LEARNER_GRACE_SECONDS)  # where the disk is slow, it takes longer than the others
 
 
@@ -165,9 +172,9 @@ def watch(learner: Supervised, actors: list[Supervised], run: LocalRun, stopping
             except FailedError as error:
                 actors.remove(actor)
                 stop([actor.process])
-                playing = sum(other.name not in _HELPERS for other in actors)
+                playing = sum(other.name not in {*_HELPERS, INFERENCE} for other in actors)
                 # A synchronous algorithm waits for all actors at its start.
-                needed = not playing or run.spec.algorithm.synchronous
+                needed = not playing or run.spec.algorithm.synchronous or actor.name == INFERENCE
                 if needed and actor.name not in _HELPERS:
                     _end(learner.process, stopping)
                     if learner.process.returncode in FINISHED:  # it had all env_steps that it needs

@@ -72,6 +72,8 @@ class RunChoice:
         if settings.get("policy", {}).get("memory", "none") != "none":
             for section, values in with_memory.items():
                 base.setdefault(section, {}).update(values)
+            if settings.get("collection", {}).get("upload") == "gradients":
+                base["training"].pop("curiosity", None)  # which needs rollouts
         if self.is_instance:
             _fit_one_environment(base, settings["training"]["algorithm"])
         settings = self._applied(base)

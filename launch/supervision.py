@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from importlib.util import find_spec
+from typing import Literal, Protocol
 
 from daedalus.launch.child_output import ChildOutput, OpenStreams, Streams, inherited
 from daedalus.launch.forked_process import ForkedProcess
@@ -18,7 +19,8 @@ from daedalus.launch.process_lifecycle import FAILED, STOPPED, interrupts_held
 
 _logger = logging.getLogger(__name__)
 
-GATEWAY = "gateway"  # name of its process
+GATEWAY, INFERENCE = "gateway", "the inference process"  # names of processes
+Inference = Literal["local", "shared", "cuda"]  # where the policies of actors run: see docs/operations.md
 # Exit status that means something for a learner only.
 _LEARNERS_RESTARTS = {STOPPED: "was stopped by a signal"}
 # Signals of a process that crashes by itself. Others come from outside: an operator, or the system.
@@ -253,6 +255,43 @@ def evaluators(
         yield failure
     finally:
         stop([each.process for each in started])
+
+
+def check_inference(inference: Inference) -> None:
+    """Raise ValueError if this system cannot share a policy between processes."""
+    if inference != "local" and not hasattr(os, "memfd_create"):
+        raise ValueError(f"--inference {inference} needs Linux: leave it out")
+    if inference == "cuda" and find_spec("torch") is None:
+        raise ValueError('--inference cuda needs torch: pip install "daedalus-rl[learner]", or use --inference shared')
+
+
+def supervised_inference(
+    inference: Inference, folder: str, options: Sequence[str], open_streams: OpenStreams = inherited
+) -> tuple[list[Supervised], list[str]]:
+    """Start the process that runs the policies of actors, if they do not run their own.
+
+    Args:
+      inference: where the policies run.
+      folder: private, for its socket.
+      options: of its log.
+      open_streams: where its output goes.
+
+    Returns the process, if there is one, and the options of the actors.
+    """
+    if inference == "local":
+        return [], []
+    path = os.path.join(folder, "policy")
+
+    def begin(_first: bool) -> Child:
+        arguments = [path, *(["--device", "cuda"] if inference == "cuda" else []), *options]
+        with open_streams("inference") as streams:
+            # Ctrl-C does not reach it: it ends after the actors. It does not yield: all actors wait for it.
+            return start(
+                "daedalus.launch.inference_process", *arguments, streams=streams, one_thread=True, own_session=True
+            )
+
+    actors = ["--inference-at", path, *(["--runtime", "torch"] if inference == "cuda" else [])]
+    return [Supervised(INFERENCE, begin, ended=frozenset(), no_fault={})], actors
 
 
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:

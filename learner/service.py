@@ -82,10 +82,11 @@ class LearnerService:
         self._context, self._outputs, self._beginning = context, outputs, beginning
         self._heartbeat = Heartbeat(context.directory)
         self._server = ActorServer(context, transport, self._status)
-        self._confirmation = None
-        if open_player is not None and context.spec.training.stop_when_solved:
+        self._episodes, self._cloned = None, False
+        if open_player is not None:
             beat = self._heartbeat.beat
-            self._confirmation = TargetConfirmation(context, self._server.publisher, open_player, beat)
+            self._episodes = TargetConfirmation(context, self._server.publisher, open_player, beat)
+        self._confirmation = self._episodes if context.spec.training.stop_when_solved else None
         self._reporter = RunReporter(context, outputs.user_metrics)
 
     def run(self) -> Outcome:
@@ -128,6 +129,8 @@ class LearnerService:
                 checkpointer.begin()  # a learner that is killed before its first checkpoint continues from this one
             if self._beginning.restored is None and not self._server.await_actor(self._heartbeat.beat):
                 return self._stopped_early("before the first actor joined")
+            if self._cloned and self._episodes is not None:
+                self._episodes.evaluate_cloned(learner)
             return self._learn(learner, checkpointer, loop)
         finally:
             self._server.close(self._why_stopped)  # unless it is closed
@@ -147,6 +150,7 @@ class LearnerService:
         if self._beginning.restored is not None:
             return True
         if result := learner.clone(self._goes_on):
+            self._cloned = True
             _logger.info("behaviour cloning: %d updates; %s", spec.training.cloning_updates, result)
         return not self._context.stop.is_set()
 

@@ -1,5 +1,7 @@
 """Confirmation of a target that was reached: the learner waits while an evaluator plays new episodes.
 
+It waits as well for those of a policy that has imitated demonstrations, before it goes on to train it.
+
 The mean of the newest training episodes reaches the target more probably in a lucky moment, and while they were played
 the policy changed. So their mean is too high on average, and the policy of that moment may be worse than those before.
 New sampled episodes with that policy show what it can do.
@@ -14,7 +16,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
 from daedalus.learner.serving.run_context import RunContext
@@ -28,7 +30,8 @@ if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
 
 _CONFIDENCE = 0.95  # share of cases that an interval is to contain
-_SEEDS = 2**34  # added to the seed of the run: no other evaluation of the run and no training uses these seeds
+# Added to the seed of the run: no other evaluation of the run and no training uses these seeds.
+_SEEDS, _CLONED_SEEDS = 2**34, 2**35
 
 _logger = logging.getLogger(__name__)
 
@@ -143,7 +146,7 @@ class TargetConfirmation:
         text = f"target {target} reached: the policy of this moment plays {episodes} to confirm it"
         self._context.events.add("target", text, cause=f"version {version}")
         try:
-            played = self._played_with(learner)
+            played = self._played_with(learner, training.target_episodes, _SEEDS, "sampled")
         except (EvaluatorError, TransportError, OSError) as error:  # of some simulators only one can run
             text = f"the target cannot be confirmed: {error}"
             self._context.events.add("target", text, cause=f"result of version {version}")
@@ -167,7 +170,21 @@ class TargetConfirmation:
         self._context.events.add("target", text, cause=f"result of version {version}")
         return False
 
-    def _played_with(self, learner: "Learner") -> tuple[EpisodePlan, EvaluationReport] | None:
+    def evaluate_cloned(self, learner: "Learner") -> None:
+        """Wait until the policy that has imitated demonstrations is evaluated: the first evaluation of the run."""
+        evaluation = self._context.spec.evaluation
+        try:
+            played = self._played_with(learner, evaluation.episodes, _CLONED_SEEDS, evaluation.actions)
+        except (EvaluatorError, TransportError, OSError) as error:
+            _logger.warning("the policy after behaviour cloning cannot be evaluated: %s", error)
+        else:
+            if played is not None:
+                result = self._context.evaluations.note(played[1], 0)
+                _logger.info("after behaviour cloning: return %s, %s", result, evaluation.actions)
+
+    def _played_with(
+        self, learner: "Learner", episodes: int, seeds: int, actions: Literal["greedy", "sampled"]
+    ) -> tuple[EpisodePlan, EvaluationReport] | None:
         """Return the episodes, or None if the run is stopped first.
 
         Raises EvaluatorError, and as `open_player`.
@@ -180,9 +197,9 @@ class TargetConfirmation:
             spec=spec,
             environment=spec.environment.as_evaluated(),
             spaces=spaces,
-            episodes=spec.training.target_episodes,
-            seed=spec.training.seed + _SEEDS,
-            actions="sampled",
+            episodes=episodes,
+            seed=spec.training.seed + seeds,
+            actions=actions,
         )
         policy = OfferedPolicy(policy_version=learner.policy_version, program=program, weights=learner.weights())
         with self._open_player() as player:

@@ -38,6 +38,7 @@ class RunningGateway:
         operator: OperatorToken | None = None,
         takes_clients: bool = True,
         reads_openly: bool = True,
+        record: str = "",
     ) -> None:
         """Start a gateway.
 
@@ -48,13 +49,14 @@ class RunningGateway:
           takes_clients: whether it has clients, or the page only.
           reads_openly: whether the page needs no token if there is none.
           follows: whether it follows a run; otherwise it serves its page only.
+          record: dataset of its clients' episodes; empty: none.
         """
         self._follows, self._operator, self._reads_openly = follows, operator, reads_openly
         self._takes_clients = takes_clients
         self._transport = MemoryTransport(network)
         self._tokens = None if certificates is None else Tokens(certificates)
         self._tls = None if certificates is None else tls_context(certificates)
-        self._config = GatewayConfig(name="gateway")
+        self._config = GatewayConfig(name="gateway", record=record)
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.port = self.listener.getsockname()[1]
         self.failure: Exception | None = None

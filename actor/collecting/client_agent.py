@@ -9,6 +9,7 @@ import gymnasium
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
 from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.client_seats import MatchSeat
+from daedalus.actor.collecting.loop_recorder import EpisodeTape
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.precision import Precision
 from daedalus.protocol.lessons import Parameters
@@ -41,6 +42,7 @@ class ClientAgent:
         """
         self._index, self._exchange, self._guard, self._check = index, exchange, guard, check
         self.seat: MatchSeat | None = None  # in the match that the loop hosts
+        self.tape: EpisodeTape | None = None  # records the episodes, if somebody asked for it
         self._rows: ClientRows | None = None
         self._loaded: LoadedPolicy | None = None  # that acts
         self.actions = self.overridden_actions = self.safe_actions = 0
@@ -90,11 +92,15 @@ class ClientAgent:
                 break
         if override is not None:
             self.overridden_actions += 1
-            return override
-        if not policy_acts:
+            action = override
+        elif not policy_acts:
             self.safe_actions += 1
-            return self._guard.action(observation)
-        return rows.env_action(actions)
+            action = self._guard.action(observation)
+        else:
+            action = rows.env_action(actions)
+        if self.tape is not None:
+            self.tape.act(observation, action)
+        return action
 
     @property
     def parameters(self) -> Parameters:
@@ -119,6 +125,8 @@ class ClientAgent:
         if self._rows is None:
             raise ValueError("a reward came before any action: call act() first")
         self._rows.reward(value)
+        if self.tape is not None:
+            self.tape.reward(value)
 
     def success(self, reward: float = 1.0, observation: Any = None) -> None:
         """Reward the last action for reaching the goal, and end the episode as terminated: for a key or a button.
@@ -145,6 +153,8 @@ class ClientAgent:
         if self._rows is None:
             raise ValueError("the episode ended without any action: call act() first")
         self._rows.end_episode(observation, terminated=terminated)
+        if self.tape is not None:
+            self.tape.end(observation, terminated=terminated)
 
     def keep(self, rows: ClientRows) -> None:
         """Hand over a full rollout. Called by the agent's rows."""

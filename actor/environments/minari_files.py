@@ -56,6 +56,15 @@ def dataset_folder(name: str) -> Path:
     return Path(get_dataset_path(name))
 
 
+def new_dataset_folder(name: str) -> Path:
+    """Return the folder of a dataset that is to be written. Raises DatasetError if it exists, or Minari is missing."""
+    _import_minari()
+    folder = dataset_folder(name)
+    if (folder / "data").exists():
+        raise DatasetError(f"dataset {name} exists at {folder}: choose another name, or remove it")
+    return folder
+
+
 def _import_minari() -> None:
     try:
         import h5py  # noqa: F401  # minari works without
@@ -307,13 +316,10 @@ class MinariWriter:
 
         Raises DatasetError if it exists.
         """
-        _import_minari()
-        self.folder = dataset_folder(name)
+        self.folder = new_dataset_folder(name)
         self._name, self.episodes, self.steps = name, 0, 0
         self._spaces, self._env_spec, self._algorithm = (observation_space, action_space), env_spec, algorithm
         self._storage: MinariStorage | None = None
-        if (self.folder / "data").exists():
-            raise DatasetError(f"dataset {name} exists at {self.folder}: choose another name, or remove it")
 
     def _created(self) -> "MinariStorage":
         from minari.dataset.minari_storage import MinariStorage

@@ -25,6 +25,7 @@ class ActorConfig:
     run: str = keys.ANY_RUN
     environments: int | None = None  # E; None: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
+    inference: str | None = None  # Unix socket of the process that runs the policy; None: this process does
     modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: as on a fast link; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever

@@ -19,10 +19,11 @@ from daedalus.actor.session.session_engine import ActorSession, Begin, Collect, 
 from daedalus.actor.session.session_thread import SessionThread
 from daedalus.actor.session.uploading import RolloutUploadMaker, UploadMaker, make_upload_maker
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError, PolicyRuntime
+from daedalus.policy.acting.shared_runtime import SharedRuntime
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import ClientReport, Snapshot, Welcome
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import ActorSpec, UnsupportedRunError
+from daedalus.protocol.spec import ActorSpec, LearningSpec, UnsupportedRunError
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import Transport
 from daedalus.transport.process_usage import UsageMeter
@@ -189,7 +190,7 @@ class ActorService:
         elif isinstance(self._own_runtime, OnnxRuntime):
             runtime = self._own_runtime.fork()
         else:
-            runtime = self._runtime(self._begin)
+            runtime = self._local_runtime(self._begin)
         runtime.load(snapshot.weights)
         return runtime
 
@@ -204,14 +205,27 @@ class ActorService:
 
     def _runtime(self, begin: Begin) -> PolicyRuntime:
         """Return the runtime of the policy."""
+        if self._config.inference is None:
+            return self._local_runtime(begin)
+        setup: dict[str, Any] = {}
+        if begin.program is None:
+            learning = _learning_of(begin).model_dump(mode="json")
+            setup = {"learning": learning, "spaces": begin.spaces.model_dump(mode="json")}
+        return SharedRuntime(self._config.inference, setup, begin.program or b"", begin.spaces, self._stop)
+
+    def _local_runtime(self, begin: Begin) -> PolicyRuntime:
         spec = begin.welcome.spec
         if begin.program is not None:
             rows = begin.environments * spec.collection.rollout_length  # a rollout is played with one snapshot
             return OnnxRuntime(begin.program, self._stop, rows)
         from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
 
-        try:
-            learning = spec.learning_settings
-        except UnsupportedRunError as error:
-            raise ActorError(str(error)) from None
+        learning = _learning_of(begin)
         return TorchRuntime(learning.policy, begin.spaces, learning.training)
+
+
+def _learning_of(begin: Begin) -> LearningSpec:
+    try:
+        return begin.welcome.spec.learning_settings
+    except UnsupportedRunError as error:
+        raise ActorError(str(error)) from None

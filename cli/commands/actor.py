@@ -4,23 +4,32 @@ import argparse
 import sys
 from typing import NoReturn
 
+from daedalus.actor.session.actor_config import own_name
 from daedalus.cli.arguments import (
     add_allow_module,
     add_connect,
+    add_inference,
     add_logging,
     add_tls,
     command_parser,
     log_options,
     seconds,
 )
+from daedalus.launch.actor_group import ActorGroup
 from daedalus.launch.actor_process import ActorOptions, LeaveRequest, run_actor
+from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
     exit_with_parent,
+    status_at_start,
     stop_on_signals,
 )
+from daedalus.launch.supervision import check_inference
 from daedalus.protocol import keys
+from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_connect
+
+_MOST_ACTORS = 1024
 
 DESCRIPTION = """\
 Plays environments and sends rollouts to a learner. An actor needs one address: the environment, the network and all
@@ -30,6 +39,7 @@ EXAMPLES = """\
 examples:
   daedalus actor --connect tcp/127.0.0.1:7447
   daedalus actor --connect tcp/gpu-box:7447 --envs 32 --name arm-3
+  daedalus actor --connect tcp/gpu-box:7447 --actors 16      (16 actors of this machine)
   daedalus actor --connect tls/gpu-box:7447 --tls actor-arm-3
   daedalus actor --connect tcp/gpu-box:7447 --allow-module corridor      (the run plays corridor:Corridor-v0)
   daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
@@ -54,6 +64,16 @@ def parser() -> argparse.ArgumentParser:
         metavar="E",
         help="number of environments to step together (default: as the learner asks)",
     )
+    options.add_argument(
+        "--actors",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of actors to start, with the names NAME.1 to NAME.N. One that fails is started again (default: "
+        "%(default)s)",
+    )
+    add_inference(options)
+    options.add_argument("--inference-at", metavar="PATH", help=argparse.SUPPRESS)  # for the actors of a group
     add_allow_module(options, "the learner")
     options.add_argument(
         "--runtime",
@@ -141,6 +161,7 @@ def actor_options(arguments: argparse.Namespace) -> ActorOptions:
         seats=tuple(arguments.seat),
         environments=arguments.envs,
         runtime=arguments.runtime,
+        inference_at=arguments.inference_at,
         link=arguments.link,
         timeout=arguments.timeout,
         allowed_modules=frozenset(arguments.allow_module),
@@ -152,11 +173,33 @@ def main() -> int:
     arguments = parser().parse_args()
     context: dict[str, str] = {}
     log_options(arguments).configure(process="actor", context=context)
+    if arguments.actors != 1 or arguments.inference != "local":
+        return _run_group(arguments)
     leave = LeaveRequest()
     stop = stop_on_signals(exit_if_stuck=True, on_leave=leave.ask)
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     return run_actor(actor_options(arguments), stop, context, leave)
+
+
+def _run_group(arguments: argparse.Namespace) -> int:
+    try:
+        if not 1 <= arguments.actors <= _MOST_ACTORS:
+            raise ValueError(f"--actors is {arguments.actors}: choose a number from 1 to {_MOST_ACTORS}")
+        if arguments.evaluator and arguments.inference != "local":
+            raise ValueError("--inference is for actors, and an evaluator runs its own policy: leave it out")
+        check_inference(arguments.inference)
+        credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
+        identity, numbers = credentials.name if credentials else "", range(1, arguments.actors + 1)
+        names = [f"{arguments.name}.{each}" if arguments.name else own_name(identity, each) for each in numbers]
+    except (ValueError, *SECURITY_ERRORS) as error:
+        print_error("actor", error)
+        return status_at_start(error)
+    group = ActorGroup(sys.argv[1:], names, arguments.inference, log_options(arguments))
+    stop = stop_on_signals(exit_if_stuck=True, on_leave=group.leave)
+    if arguments.exit_with_parent:
+        exit_with_parent(stop)
+    return group.run(stop)
 
 
 def run_process() -> NoReturn:

@@ -90,6 +90,12 @@ def _add_serving(options: argparse.ArgumentParser) -> None:
         metavar="URL",
         help="web site whose pages may connect, such as http://localhost:3000. May be given several times",
     )
+    options.add_argument(
+        "--record",
+        default="",
+        metavar="DATASET",
+        help="new Minari dataset of the episodes that clients play, with the actions of people: see daedalus record",
+    )
 
 
 def _add_page(options: argparse.ArgumentParser) -> None:
@@ -152,6 +158,7 @@ def gateway_options(arguments: argparse.Namespace) -> GatewayOptions:
         run_directory=arguments.run_dir,
         allowed_modules=arguments.allow_module,
         takes_clients=not arguments.page_only,
+        record=arguments.record,
         for_a_person=arguments.exit_with_parent,
     )
 

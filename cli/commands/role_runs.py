@@ -92,7 +92,7 @@ def resume_roles(parsed: argparse.Namespace, directories: Mapping[str, Path], sc
 
 def _refuse_options(parsed: argparse.Namespace) -> None:
     """Raise SettingsError for what only one run can have."""
-    one = {"--watch": parsed.watch, "--tls": parsed.tls}
+    one = {"--watch": parsed.watch, "--tls": parsed.tls, "--inference": parsed.inference != "local"}
     one |= {f"--{name}": getattr(parsed, name.replace("-", "_"), None) for name in ("init-from", "demonstrations")}
     for option, value in one.items():
         if value:

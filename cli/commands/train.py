@@ -14,6 +14,7 @@ from typing import Any
 
 from daedalus.cli.arguments import (
     add_allow_module,
+    add_inference,
     add_insecure,
     add_logging,
     add_reset_statistics,
@@ -47,6 +48,7 @@ from daedalus.launch.process_lifecycle import (
 )
 from daedalus.launch.resumed_run import ResumeChoice, locked_to_resume, resumed_run, status_of
 from daedalus.launch.run_choice import create_run
+from daedalus.launch.supervision import check_inference
 from daedalus.learner.reporting.progress import is_terminal
 from daedalus.learner.reporting.trackers.tracking import chosen_trackers
 from daedalus.learner.run import run_directory
@@ -113,6 +115,7 @@ def train(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         _check_watching(parsed)
+        _check_inference(parsed)
         new = new_run(parsed)
     except (SettingsError, *SECURITY_ERRORS) as error:
         print_error("train", error)
@@ -156,6 +159,7 @@ def resume(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         _check_watching(parsed)
+        _check_inference(parsed)
         if directories := run_directory.role_directories(parsed.directory):
             from daedalus.cli.commands.role_runs import resume_roles
 
@@ -266,6 +270,7 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
         help="let every user of this machine take part at /actor and /play of that page (with --watch)",
     )
     options.add_argument("--no-camera", action="store_true", help="play no episodes for the page (with --watch)")
+    add_inference(options)
     add_tls(options)
     add_insecure(options)
     add_logging(options)
@@ -284,6 +289,13 @@ def _check_watching(parsed: argparse.Namespace) -> None:
         raise SettingsError(f"--watch: {INSTALL}")
 
 
+def _check_inference(parsed: argparse.Namespace) -> None:
+    try:
+        check_inference(parsed.inference)
+    except ValueError as error:
+        raise SettingsError(str(error)) from None
+
+
 def _check_listening(parsed: argparse.Namespace) -> None:
     credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
 
@@ -291,6 +303,7 @@ def _check_listening(parsed: argparse.Namespace) -> None:
 def machine_options(parsed: argparse.Namespace, directory: Path) -> dict[str, Any]:
     """Return the fields of a LocalRun that `_add_machine_options` and `add_log` define."""
     return {
+        "inference": parsed.inference,
         "listen": parsed.listen,
         "tls": parsed.tls,
         "insecure": parsed.insecure,

@@ -47,6 +47,9 @@ def default_settings(
     for section, values in settings.pop("for_two_seats", {}).items():
         if seats == _FULL_SEATS:
             settings[section] |= values
+    if seats > 1:
+        for name in ("entropy_bonus", "curiosity"):  # were not measured in games
+            settings["with_memory"]["training"].pop(name, None)
     if seats > _FULL_SEATS:
         for collection in (settings["collection"], settings["with_memory"]["collection"]):
             collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)

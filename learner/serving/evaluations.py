@@ -86,17 +86,21 @@ class Evaluations:
         if (report.lengths < 1).any():
             return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), None
         del self.in_progress[report.evaluator]
-        mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
+        mean = float(report.returns.mean(dtype=np.float64))
         self.counters.evaluated(mean)
+        text = f"evaluation at {env_steps:,} env_steps: {self.note(report, env_steps)}"
+        return Acknowledgement(verdict="accepted"), Evaluated(directory, version, mean, text)
+
+    def note(self, report: EvaluationReport, env_steps: int) -> str:
+        """Let a report be the newest evaluation in the metrics, and return its result in words."""
+        mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
         self.newest = {
             "evaluation_return_mean": mean,
             "evaluation_return_std": std,
             "evaluation_length_mean": float(report.lengths.mean()),
             "evaluation_env_steps": env_steps,
         }
-        result = f"{short_number(mean)} +- {short_number(std)} over {len(report.returns)} episodes"
-        text = f"evaluation at {env_steps:,} env_steps: {result}"
-        return Acknowledgement(verdict="accepted"), Evaluated(directory, version, mean, text)
+        return f"{short_number(mean)} +- {short_number(std)} over {len(report.returns)} episodes"
 
     def take_newest(self) -> dict[str, float]:
         """Return the newest evaluation as metrics; empty without an evaluation since the last call."""

@@ -6,6 +6,7 @@ import secrets
 import time
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,6 +61,11 @@ class ReplayLearner(Learner):
     def replay_identity(self) -> int:
         """Random number of the run, which its saved replay buffer bears."""
         return int(self._identity)
+
+    def load(self, parameters: dict[str, np.ndarray]) -> None:
+        """See Learner. The critics get the convolutions of the policy."""
+        super().load(parameters)
+        self._algorithm.take_convolutions()
 
     def learn_from(self, demonstrations: ReplayBuffer) -> None:
         """See Learner: they are a share of each minibatch."""

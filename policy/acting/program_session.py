@@ -67,6 +67,7 @@ MAX_MEMORY_BYTES = 1 << 30  # of all tensors that the programs of this process c
 # onnxruntime computes constants when it loads a program, in memory that the limit above does not cover.
 _MAX_CONSTANT_BYTES = 256 << 10  # each; a program has at most MAX_NODES
 _CONFIGURATION = {
+    "session.intra_op.allow_spinning": "0",  # spinning threads would take time from other processes
     "session.use_env_allocators": "1",
     "session.load_model_format": "ONNX",  # not onnxruntime's own format, which the checks do not read
     # A model may name files to read weights from. A received program must not read files: no such file exists here.
@@ -78,12 +79,12 @@ _CONFIGURATION = {
 class ProgramSession:
     """A loaded program. The caller has checked it (policy/acting/program_check.py)."""
 
-    def __init__(self, model: bytes, watchdog: CallWatchdog) -> None:
+    def __init__(self, model: bytes, watchdog: CallWatchdog, threads: int = 1) -> None:
         """Raise PolicyError if onnxruntime cannot load the program."""
         _bound_memory()
         options = onnxruntime.SessionOptions()
-        # An actor has one core at most; spinning threads would take time from other processes.
-        options.intra_op_num_threads = 1
+        # An actor has one core at most.
+        options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 4
         for name, value in _CONFIGURATION.items():

@@ -154,25 +154,28 @@ def action_name(component: str) -> str:
 
 
 class OnnxRuntime:
-    """Runs a program with onnxruntime on one thread.
+    """Runs a program with onnxruntime, on one thread by default.
 
     Weights are passed as inputs with every call, which is the fastest way for small networks. A program with
     convolutions is instead loaded again for each snapshot, with the weights as constants, unless a snapshot is used for
     few rows.
     """
 
-    def __init__(self, model: bytes, stop: threading.Event | None = None, rows: int | None = None) -> None:
+    def __init__(
+        self, model: bytes, stop: threading.Event | None = None, rows: int | None = None, threads: int = 1
+    ) -> None:
         """Raise PolicyError if `model` is not a program as policy/acting/program.py exports it.
 
         Args:
           model: the program.
           stop: ends a call that is in progress; it then raises PolicyError.
           rows: for how many rows each snapshot is used, at least; None: many.
+          threads: of a call.
         """
         check_program(model, _is_input)
-        self._model, self._stop = model, stop
+        self._model, self._stop, self._threads = model, stop, threads
         self._watchdog = CallWatchdog(stop)
-        self._session = ProgramSession(model, self._watchdog)
+        self._session = ProgramSession(model, self._watchdog, threads)
         onnx_inputs, onnx_outputs = self._session.onnx.get_inputs(), self._session.onnx.get_outputs()
         inputs = {entry.name: tuple(entry.shape) for entry in onnx_inputs}
         self._actions = _action_components([entry.name for entry in onnx_outputs], STATE in inputs)
@@ -226,7 +229,7 @@ class OnnxRuntime:
                 )
         bound = {name: weights[name] for name in self._shapes}
         if self._loads_again:
-            self._session = ProgramSession(with_initializers(self._model, bound), self._watchdog)
+            self._session = ProgramSession(with_initializers(self._model, bound), self._watchdog, self._threads)
         else:
             self._feed = bound
 

@@ -12,20 +12,32 @@ from daedalus.protocol.spec import LossSpec, PolicySpec
 
 
 class TorchRuntime:
-    """Runs the network with torch on one thread."""
+    """Runs the network with torch, on one thread of the CPU by default."""
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces, training: LossSpec | None = None) -> None:
-        """Raise PolicyError if the network cannot be built, or has code that the user supplies.
+    def __init__(
+        self,
+        spec: PolicySpec,
+        spaces: Spaces,
+        training: LossSpec | None = None,
+        *,
+        device: str = "cpu",
+        threads: int = 1,
+    ) -> None:
+        """Raise PolicyError if the network cannot be built, has code that the user supplies, or there is no `device`.
 
         `training` is as for ActorCritic.
         """
+        if device == "cuda" and not torch.cuda.is_available():
+            raise PolicyError(f"torch {torch.__version__} finds no GPU here: use --inference shared")
         for name in (spec.encoder, spec.distribution):
             if ":" in name:
                 # The name came over the wire; importing it would execute code that another process chose.
                 raise PolicyError(f"{name!r} is custom code, not imported here: use --runtime onnx")
-        torch.set_num_threads(1)
+        torch.set_num_threads(threads)
+        self._device = device
         try:
-            self._network = ActorCritic(spec, spaces, training=training).eval().requires_grad_(False)
+            network = ActorCritic(spec, spaces, training=training)
+            self._network = network.to(device).eval().requires_grad_(False)
         except NetworkError as error:
             raise PolicyError(str(error)) from None
         self._noise_size = NoiseSize(self._network.uniform_count, self._network.distribution.normal_count)
@@ -73,16 +85,19 @@ class TorchRuntime:
     ) -> Choice:
         """See PolicyRuntime."""
         tensors = {
-            name: torch.from_numpy(values.astype(np.int64) if name in self._discrete else values)
+            name: self._tensor(values.astype(np.int64) if name in self._discrete else values)
             for name, values in observations.items()
         }
         actions, log_probs, next_state = self._network.act(
             tensors,
-            torch.from_numpy(state),
-            torch.from_numpy(noise.uniform),
-            torch.from_numpy(noise.normal),
-            {name: torch.from_numpy(mask) for name, mask in masks.items()},
-            torch.from_numpy(no_exploration(len(state)) if epsilon is None else epsilon),
+            self._tensor(state),
+            self._tensor(noise.uniform),
+            self._tensor(noise.normal),
+            {name: self._tensor(mask) for name, mask in masks.items()},
+            self._tensor(no_exploration(len(state)) if epsilon is None else epsilon),
         )
-        chosen = {name: values.numpy() for name, values in actions.items()}
-        return Choice(chosen, log_probs.numpy(), next_state.numpy() if self.state_size else state)
+        chosen = {name: values.cpu().numpy() for name, values in actions.items()}
+        return Choice(chosen, log_probs.cpu().numpy(), next_state.cpu().numpy() if self.state_size else state)
+
+    def _tensor(self, values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(values).to(self._device)

@@ -83,12 +83,36 @@ class ImageEncoder(nn.Module):
         self.head, self.features = head(inputs)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Encode observations: [N, *stacked_shape] -> [N, features]."""
-        return self.head(self.convolutions(self.layout.arrange(self.prepare(observations))).flatten(1))
+        """Encode observations: [N, *stacked_shape], or what `convolve` returns of them -> [N, features]."""
+        return self.head(observations if observations.dim() == 2 else self.convolve(observations))
+
+    def convolve(self, observations: Tensor, *, shifted: bool = False) -> Tensor:
+        """Return the outputs of the convolutions: [N, *stacked_shape] -> [N, F].
+
+        `shifted`: shift each image by random numbers of pixels before.
+        """
+        images = self.layout.arrange(self.prepare(observations))
+        return self.convolutions(_shifted(images) if shifted else images).flatten(1)
 
     def prepare(self, observations: Tensor) -> Tensor:
         """Convert observations to the numbers that the first convolution takes; that convolution scales bytes."""
         return as_floats(observations)
+
+
+def _shifted(images: Tensor) -> Tensor:
+    """Shift each image [N, C, H, W] at random, by at most 4 of 84 pixels; what comes in at a border is repeated.
+
+    Kostrikov et al. (2021), "Image Augmentation Is All You Need", section 3.1.
+    """
+    count, _, height, width = images.shape
+    most = -(-4 * min(height, width) // 84)
+    down, right = torch.randint(-most, most + 1, (2, count, 1)).to(images.device)
+    rows = (torch.arange(height, device=images.device) + down).clamp_(0, height - 1)  # [N, H]
+    columns = (torch.arange(width, device=images.device) + right).clamp_(0, width - 1)
+    rows += height * torch.arange(count, device=images.device)[:, None]
+    pixels = images.permute(0, 2, 3, 1).flatten(0, 2)  # [N * H * W, C]
+    shifted = pixels.index_select(0, (width * rows[:, :, None] + columns[:, None]).flatten())
+    return shifted.view(count, height, width, -1).permute(0, 3, 1, 2)
 
 
 def nature(space: ArraySpace) -> ImageEncoder:

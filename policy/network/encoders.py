@@ -81,6 +81,11 @@ class ArrayEncoder(nn.Module):
         for child_name, child in encoder.named_children():
             self.add_module(child_name, child)
 
+    @property
+    def image_encoders(self) -> dict[str, ImageEncoder]:
+        """The encoder of each image, by component."""
+        return {self._name: self._encoder[0]}
+
     def forward(self, observations: Components) -> Tensor:
         """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
         return self._encoder[0](observations[self._name])
@@ -92,21 +97,31 @@ class CompositeEncoder(nn.Module):
     def __init__(self, images: dict[str, ArraySpace], others: ObservationSpaces, spec: PolicySpec) -> None:
         super().__init__()
         self._names = tuple(images)
-        encoders = [_image_encoder(spec.encoder, space) for space in images.values()]
+        self._encoders = encoders = [_image_encoder(spec.encoder, space) for space in images.values()]
         self.images = nn.ModuleList(encoders)
         self.others = FlatEncoder(others, spec) if others else None
         self.features = sum(encoder.features for encoder in encoders)
         self.features += self.others.features if self.others is not None else 0
 
+    @property
+    def image_encoders(self) -> dict[str, ImageEncoder]:
+        """The encoder of each image, by component."""
+        return dict(zip(self._names, self._encoders, strict=True))
+
     def forward(self, observations: Components) -> Tensor:
         """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
-        parts = [encoder(observations[name]) for name, encoder in zip(self._names, self.images, strict=True)]
+        parts = [encoder(observations[name]) for name, encoder in self.image_encoders.items()]
         if self.others is not None:
             parts.append(self.others(observations))
         return torch.cat(parts, -1)
 
 
 Encoder = FlatEncoder | ArrayEncoder | CompositeEncoder | CustomEncoder
+
+
+def image_encoders(encoder: Encoder) -> dict[str, ImageEncoder]:
+    """Return the encoder of each image, by component: it takes the outputs of its convolutions in place of images."""
+    return encoder.image_encoders if isinstance(encoder, ArrayEncoder | CompositeEncoder) else {}
 
 
 def build_codes(spec: PolicySpec, spaces: ObservationSpaces) -> OneHotCodes:

@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -15,6 +16,7 @@ from scripted_learner import ScriptedLearner, acknowledge
 from daedalus.actor import Client
 from daedalus.actor import client as client_module
 from daedalus.actor.collecting.client_collector import ClientCollector
+from daedalus.actor.environments.minari_files import DatasetError, MinariReader
 from daedalus.actor.errors import ActorError
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Acknowledgement, ClientReport, Refusal
@@ -48,6 +50,34 @@ def test_client_rollouts_reach_the_learner(learner: ScriptedLearner) -> None:
         rollout, _ = learner.receive()
         assert (rollout.identity.actor, rollout.policy_version) == ("robot", 0)
         assert not client.is_over
+
+
+def test_client_records_what_is_played(learner: ScriptedLearner, tmp_path: Path) -> None:
+    place = tmp_path / "played"
+    observation = np.zeros(4, np.float32)
+    with Client("tcp/127.0.0.1:1", **SPACES, record=place) as client:
+        played = []
+        for step in range(3):
+            observation[0] = step  # a loop may use its arrays again
+            played.append(client.act(observation, override=1 if step == 1 else None))
+            client.reward(float(step))
+        client.end_episode(terminated=False, observation=observation + 1.0)
+        client.reward(0.5)  # late: of the last action
+        client.act(observation, override=7)  # no action of the space
+        client.success()
+        client.act(observation)
+        client.success()
+        client.act(observation)  # its episode has no end
+    with MinariReader(str(place)) as dataset:
+        first, second = list(dataset)
+    np.testing.assert_array_equal(first.observations[:, 0], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(first.actions, played)
+    np.testing.assert_array_equal(first.rewards, [0.0, 1.0, 2.5])
+    assert (first.terminated, first.truncated, second.terminated) == (False, True, True)
+    np.testing.assert_array_equal(second.rewards, [1.0])
+    np.testing.assert_array_equal(second.observations[:, 0], [2.0, 2.0])  # nothing follows a termination
+    with pytest.raises(DatasetError, match="exists at"):
+        Client("tcp/127.0.0.1:1", **SPACES, record=place)
 
 
 def test_client_may_wait_for_ever(learner: ScriptedLearner) -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch import distributions as reference
+from torch.nn import functional
 
 from daedalus.algorithms.forward import FlatParameters
 from daedalus.algorithms.gradients import GradientComputer
@@ -14,7 +15,9 @@ from daedalus.algorithms.recording import EARLIER_CALLS
 from daedalus.algorithms.replay_buffer import Transitions
 from daedalus.algorithms.sac import Sac, TwinCritics
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.convolutional import ImageEncoder, ImageLayout
 from daedalus.policy.network.distributions import SquashedGaussian
+from daedalus.policy.network.encoders import image_encoders
 from daedalus.policy.user_modules import NO_MODULES, NetworkError
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -195,10 +198,52 @@ def test_other_actions_are_refused_in_one_line(actions: dict[str, ActionSpace], 
     assert "use appo" in str(refusal.value)
 
 
-def test_images_have_an_encoder_of_the_critics() -> None:
-    pixels = ArraySpace(shape=(20, 20), dtype="uint8", frames=2)
-    spaces = Spaces(observations={"pixels": pixels}, actions={"leg": LEG})
-    critics = TwinCritics(POLICY, spaces, NO_MODULES)
-    assert any(isinstance(module, nn.Conv2d) for module in critics.modules())
-    images = torch.randint(0, 255, (4, 2, 20, 20), dtype=torch.uint8)
-    assert critics({"pixels": images}, torch.zeros(4, 1)).shape == (2, 4)
+PIXELS = ArraySpace(shape=(42, 42), dtype="uint8", frames=2)
+
+
+def test_convolutions_are_those_of_the_critics() -> None:
+    spaces = Spaces(observations={"pixels": PIXELS}, actions={"leg": LEG})
+    spec = TrainingSpec(algorithm="sac")
+    network = ActorCritic(POLICY, spaces, training=spec)
+    computer, critics = GradientComputer(spec, network, spaces), TwinCritics(POLICY, spaces, NO_MODULES)
+    sac = computer.algorithm
+    assert isinstance(sac, Sac)
+    sac.build(critics, network, computer.parameters, target_rate=0.1, is_mixed=False)
+    ours, theirs = (image_encoders(each.encoder)["pixels"].convolutions for each in (network, critics))
+
+    def same() -> bool:
+        return all(torch.equal(one, other) for one, other in zip(ours.parameters(), theirs.parameters(), strict=True))
+
+    assert same(), "the critics begin with those of the policy, which may come from another run"
+    now, then = ({"pixels": torch.randint(0, 255, (4, 2, 42, 42), dtype=torch.uint8)} for _ in range(2))
+    batch = Transitions(now, then, torch.zeros(4, 1), torch.ones(4), torch.ones(4))
+    network.policy_head.weight.data.normal_()
+    gradients, _ = sac.gradients(batch)
+    learned = {name: each.numel() for name, each in network.named_parameters() if each.requires_grad}
+    changed = {
+        name
+        for name, part in zip(learned, gradients["policy"].split([*learned.values()]), strict=True)
+        if part.abs().max() > 0.0
+    }
+    assert changed == {name for name in learned if "convolutions" not in name}
+    sac.learned["critics"].sub_(gradients["critics"])
+    assert not same()
+    sac.after_update(1, computer.forward)
+    assert same()
+
+
+def test_images_are_shifted_with_their_borders_repeated() -> None:
+    encoder = ImageEncoder(
+        ImageLayout("small", PIXELS), nn.Sequential(nn.Identity()), lambda size: (nn.Identity(), size)
+    )
+    images = torch.randint(0, 255, (20, 2, 42, 42), dtype=torch.uint8)
+    torch.manual_seed(1)
+    shifted = encoder.convolve(images, shifted=True).reshape(images.shape)
+    assert torch.equal(encoder.convolve(images).reshape(images.shape), images.float())
+    padded, found = functional.pad(images.float(), (2, 2, 2, 2), mode="replicate"), set()
+    for image, wide in zip(shifted, padded, strict=True):
+        places = [(y, x) for y in range(5) for x in range(5) if torch.equal(image, wide[:, y : y + 42, x : x + 42])]
+        assert len(places) == 1
+        found.add(places[0])
+    assert {0, 4} <= {y for y, _ in found}
+    assert {0, 4} <= {x for _, x in found}

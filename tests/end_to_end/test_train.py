@@ -39,7 +39,8 @@ def newest_checkpoint(directory: Path) -> Path:
 def is_nothing_left(output: str) -> bool:
     """Return whether the socket of a finished `daedalus train` is gone, and the processes that connected to it."""
     socket_file = output.split("unixsock-stream/")[1].split(";")[0]
-    return not Path(socket_file).parent.exists() and not processes_mentioning(socket_file)
+    folder = Path(socket_file).parent
+    return not folder.exists() and not processes_mentioning(str(folder))
 
 
 def is_free(directory: Path) -> bool:
@@ -189,7 +190,7 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
 
 
 def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: Path) -> None:
-    running = start("train", "cartpole", "--run-dir", "stopped-run", *ENDLESS, *SLOW)
+    running = start("train", "cartpole", "--run-dir", "stopped-run", *ENDLESS, *SLOW, "--inference", "shared")
     running.expect(r"updates .*/s")
     assert not any(map(listening_ports, processes_mentioning("stopped-run")))  # every user could connect there
     running.process.terminate()
@@ -201,7 +202,7 @@ def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: 
 
 
 def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ended(start: Start, tmp_path: Path) -> None:
-    running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS, *SLOW)
+    running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS, *SLOW, "--inference", "shared")
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
     second = start("resume", "orphan-run", *PLAYING_SLOW)

@@ -1,12 +1,14 @@
 """The gateway over MemoryTransport: clients play, and their rollouts reach a learner."""
 
 import asyncio
+import contextlib
 import json
 import socket
 import statistics
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -18,6 +20,7 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
+from daedalus.actor.environments.minari_files import MinariReader
 from daedalus.gateway import client_gateway, connection, policy_versions, server
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_gateway import Gateway
@@ -546,6 +549,21 @@ def test_clients_of_a_synchronous_run_go_on_between_updates_and_those_rows_are_n
         assert second.rewards.tolist() == [[1.0]] * ROWS
     finally:
         learner.transport.close()
+
+
+def test_episodes_of_clients_are_recorded(network: MemoryNetwork, learner: ScriptedLearner, tmp_path: Path) -> None:
+    running = RunningGateway(network, record=str(tmp_path / "played"))
+    with contextlib.closing(running), contextlib.closing(JsonClient(running.port)) as client:
+        client.hello("arm-1")
+        played = [client.act([0.0, 0.0, 0.0, 0.0], override=1)["action"]]
+        played.append(client.act([1.0, 0.0, 0.0, 0.0], reward=1.0)["action"])
+        client.send("reward", reward=0.5)
+        client.send("end_episode", terminated=True, observation=[2.0, 0.0, 0.0, 0.0], reward=1.0)
+        client.act([9.0, 0.0, 0.0, 0.0])  # its episode is cut: nobody knows how it would have ended
+    with MinariReader(str(tmp_path / "played")) as dataset:
+        (episode,) = dataset
+    assert episode.observations[:, 0].tolist() == [0.0, 1.0, 2.0]
+    assert (episode.actions.tolist(), episode.rewards.tolist(), episode.terminated) == (played, [1.0, 1.5], True)
 
 
 def test_override_is_the_action_and_its_row_is_marked(learner: ScriptedLearner, connect: Connect) -> None:

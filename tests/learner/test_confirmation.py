@@ -27,7 +27,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
-from daedalus.protocol.spec import EnvironmentSpec, RunSpec, TrainingSpec
+from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec, RunSpec, TrainingSpec
 from daedalus.transport.interface import TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -121,7 +121,8 @@ class Scene:
 
     def __init__(self, directory: Path, play: Play) -> None:
         training = TrainingSpec(target_return=475.0, target_episodes=2, seed=7)
-        spec = RunSpec(environment=EnvironmentSpec(id="A-v0"), training=training)
+        evaluation = EvaluationSpec(episodes=2)
+        spec = RunSpec(environment=EnvironmentSpec(id="A-v0"), training=training, evaluation=evaluation)
         self.context = RunContext.begin(directory, spec, threading.Event(), spaces=vector_spaces(2, 4))
         self.play, self.starts, self.failure, self.opened = play, True, "", 0
         publisher = SnapshotPublisher(self.context, MemoryTransport(MemoryNetwork()))
@@ -191,6 +192,27 @@ def test_learner_says_what_to_play_and_with_which_policy(tmp_path: Path) -> None
     assert (result["confirmed"], result["return_mean"], result["length_mean"]) == (True, 475.0, 9.0)
     assert (result["policy_version"], result["seed"], result["notes"]) == (1, 7 + 2**34, ["2 were cut"])
     assert scene.texts == ["target 475 reached: the policy of this moment plays 2 new episodes to confirm it"]
+
+
+def test_a_cloned_policy_has_the_first_evaluation_of_the_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def play(ask: Callable[[str, Any], Message]) -> None:
+        welcome = ask(keys.join("*", "p"), Join(actor="p", incarnation=1))
+        assert isinstance(welcome, Welcome)
+        assert (welcome.play_episodes, welcome.spec.evaluation.actions) == (2, "greedy")
+        ask(keys.evaluations(scene.context.name, "p"), EvaluationRequest(evaluator="p"))
+        ask(keys.evaluations(scene.context.name, "p"), report(30.0, version=0))
+
+    scene = Scene(tmp_path, play)
+    scene.learner.policy_version = 0
+    caplog.set_level("INFO")
+    scene.confirmation.evaluate_cloned(cast("Learner", scene.learner))
+    assert "after behaviour cloning: return 30.0 +- 0 over 2 episodes, greedy" in caplog.text
+    newest = scene.context.evaluations.take_newest()
+    assert (newest["evaluation_return_mean"], newest["evaluation_env_steps"]) == (30.0, 0)
+    scene.starts = False
+    scene.confirmation.evaluate_cloned(cast("Learner", scene.learner))
+    assert "the policy after behaviour cloning cannot be evaluated: no display" in caplog.text
+    assert not scene.context.evaluations.take_newest()
 
 
 def test_after_an_attempt_training_goes_on_for_as_long_as_it_took(tmp_path: Path) -> None:

@@ -117,20 +117,49 @@ def test_run_may_become_curious_at_a_resume() -> None:
     plain.restore(4, curious.weights(), curious.state())
 
 
-def test_warning_says_once_that_observations_do_not_come_back(
+def test_curiosity_stops_and_says_so_where_observations_do_not_come_back(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(curiosity, "_JUDGED_ROWS", 50)  # as few as there are here
-    learner = Learner(TrainingSpec(curiosity=1.0), POLICY, SPACES)
+    learner = Learner(TrainingSpec(algorithm="appo", curiosity=1.0), POLICY, SPACES)
     for batch in walk(1, 8):
         learner.step(batch, 0.0)
     assert not caplog.records
-    learner = Learner(TrainingSpec(curiosity=1.0), POLICY, SPACES)
+    assert learner.take_diagnostics()["curiosity_reward_mean"] > 0.0
+    learner = Learner(TrainingSpec(algorithm="appo", curiosity=1.0), POLICY, SPACES)
+    rewarded = []
     for number in range(8):
         learner.step([make_rollout(identity(sequence=number), seed=number)], 0.0)
-    assert [record.getMessage()[:47] for record in caplog.records] == [
-        "training.curiosity hardly tells rows apart: 100"
-    ]
+        rewarded.append(learner.take_diagnostics()["curiosity_reward_mean"] > 0.0)
+    assert rewarded[0]
+    assert rewarded == sorted(rewarded, reverse=True)
+    assert not rewarded[-1]
+    assert [record.getMessage()[:34] for record in caplog.records] == ["training.curiosity stops: 100 % of"]
+
+
+@pytest.mark.parametrize("other", [0, 1, 4])
+def test_reward_fades_where_all_episodes_have_equally_many_observations(other: int) -> None:
+    """Episodes of one step in eight environments. In `other` of them, the first one ends where it began."""
+    environments = 8
+    numbers = np.tile(np.array([0, 1, 0, 1, 0, 1, 0], np.float32)[:, None], (1, environments))
+    numbers[1, :other] = 0.0
+    valid = np.tile(np.array([True, False] * 3)[:, None], (1, environments))
+    rollout = make_rollout(
+        environments=environments,
+        frames=numbers[..., None].repeat(3, 2),
+        valid=valid,
+        terminated=valid,
+        truncated=np.zeros_like(valid),
+        episode_returns=np.zeros(3 * environments, np.float32),
+        episode_lengths=np.ones(3 * environments, np.int32),
+    )
+    curious = curiosity.Curiosity(DISCOUNT)
+    curious.look([rollout], 1.0)
+    first = [1.0] * (24 - other) + [0.0] * other
+    divisor = max(np.std(first), np.mean(first) / 5.0)
+    expected = np.mean(first) / divisor * min(4.0 * np.std(first), 1.0)
+    assert curious.metrics()["curiosity_reward_mean"] == pytest.approx(expected)
+    assert bool(expected) == bool(other)
 
 
 def test_curiosity_refuses_gradients_of_actors() -> None:

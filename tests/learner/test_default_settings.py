@@ -145,8 +145,10 @@ def test_a_message_can_carry_a_rollout(where: Spaces, rows: int, environments: i
     ],
 )
 def test_rollouts_of_many_seats_are_no_larger(where: Spaces, seats: int, rows: int, copies: int) -> None:
-    collection = default_settings(where, seats=seats)["collection"]
+    settings = default_settings(where, seats=seats)
+    collection, with_memory = settings["collection"], settings["with_memory"]["training"]
     assert (collection["rollout_length"], collection["envs_per_actor"]) == (rows, copies)
+    assert not {"curiosity", "entropy_bonus"} & set(with_memory)  # which were measured with one agent
 
 
 def test_components_to_leave_out_become_a_setting() -> None:
