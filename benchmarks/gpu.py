@@ -4,7 +4,8 @@
     python -m benchmarks.gpu --device cpu --rows 256 --seconds 1 --parts learner fleet      (to try the script)
 
 The learner alone makes updates of decoded rollouts, 16 rows of 16 environments each; the article's network with its GRU
-learns from 15 rows of 256 environments. The limit is a plain torch loop on a batch that is on the device: the Nature
+learns from 15 rows of 256 environments. Pong is played with policies in the actors, and with twice as many actors whose
+policies run in one process on the device. The limit is a plain torch loop on a batch that is on the device: the Nature
 network with bfloat16, forward pass, backward pass and Adam, launched operation by operation and as a CUDA graph. Prints
 Markdown tables for docs/results.md.
 """
@@ -188,7 +189,7 @@ def fleet_table(device: str, sizes: list[int], seconds: float, actors: int) -> s
     return table(("rows of a rollout", *PIXELS_HEADER), lines)
 
 
-def pong(device: str, env_steps: int, actors: int) -> float:
+def pong(device: str, env_steps: int, actors: int, inference: str) -> float:
     """Measure env_steps/s of `daedalus train pong` with the Nature network, after the warm-up."""
     settings = {
         "policy.encoder": "nature",
@@ -204,7 +205,7 @@ def pong(device: str, env_steps: int, actors: int) -> float:
         "evaluation.final_episodes": 1,
     }
     words = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
-    return learning_rate("pong", "--env-steps", env_steps, *words)
+    return learning_rate("pong", "--env-steps", env_steps, "--inference", inference, *words)
 
 
 def main() -> None:
@@ -215,7 +216,10 @@ def main() -> None:
     options.add_argument("--seconds", type=float, default=4.0, help="duration of each measurement of the learner")
     options.add_argument("--fleet-seconds", type=float, default=25.0)
     options.add_argument(
-        "--actors", type=int, default=max((os.cpu_count() or 2) - 2, 2), help="of Pong, and half of the fleet's"
+        "--actors",
+        type=int,
+        default=max((os.cpu_count() or 2) - 2, 2),
+        help="of Pong, and half of those of the fleet and of Pong with one process for the policies",
     )
     options.add_argument("--env-steps", type=int, default=1_000_000, help="of Pong")
     parsed = options.parse_args()
@@ -237,9 +241,10 @@ def main() -> None:
     if "fleet" in parsed.parts:
         print(fleet_table(parsed.device, parsed.rows, parsed.fleet_seconds, parsed.actors), "\n", flush=True)
     if "pong" in parsed.parts:
-        print(
-            f"Pong with {parsed.actors} actors: {pong(parsed.device, parsed.env_steps, parsed.actors):,.0f} env_steps/s"
-        )
+        one_process = "cuda" if parsed.device == "cuda" else "shared"
+        for actors, inference in ((parsed.actors, "local"), (2 * parsed.actors, one_process)):
+            speed = pong(parsed.device, parsed.env_steps, actors, inference)
+            print(f"Pong with {actors} actors, --inference {inference}: {speed:,.0f} env_steps/s", flush=True)
 
 
 if __name__ == "__main__":

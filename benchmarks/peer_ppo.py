@@ -19,13 +19,13 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import cv2
+import cv2  # pyright: ignore[reportMissingImports]
 import gymnasium
 import numpy as np
 from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
-from stable_baselines3.common.vec_env import DummyVecEnv  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv  # pyright: ignore[reportMissingImports]
 
 _ENVIRONMENTS, _EPISODES = 8, 100
 _SMALLEST_IMAGE = 36  # pixels of the shorter side that its CnnPolicy takes
@@ -72,7 +72,7 @@ class SharedPolicy(DummyVecEnv):
         self._pictures = len(space.shape) == 3
         if self._pictures:
             space = gymnasium.spaces.Box(0, 255, (84, 84, 1), np.uint8)
-        super(DummyVecEnv, self).__init__(copies * len(agents), space, games[0].action_space(agents[0]))
+        VecEnv.__init__(self, copies * len(agents), space, games[0].action_space(agents[0]))
         self._games, self._agents, self._seed = games, agents, seed
         self._returns = np.zeros(self.num_envs)
 

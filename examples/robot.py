@@ -17,7 +17,8 @@ not succeeded after a second, ever less often. Between the arm and the learner i
 forwards, one piece in a hundred by more than 200 ms, and cuts all connections every 30 seconds. The arm never waits for
 the network: the program prints how many of its deadlines of 50 Hz it missed.
 
-With `robot:Camera`, and `--camera` of this program, the arm sees a picture in place of numbers.
+With `robot:Camera`, and `--camera` of this program, the arm sees a picture in place of numbers. An update then takes
+several times as long: use a learner with cores of its own, or a GPU.
 """
 
 import argparse

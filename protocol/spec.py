@@ -391,6 +391,10 @@ class TrainingSpec(LossSpec):
     the next setting."""
     cloning_weight: Annotated[float, Field(ge=0.0)] = 0.1
     """Weight of the imitation of demonstrations in the loss at the start; it falls linearly to 0 over the budget."""
+    mean_first_value: bool = False
+    """Let the values of all states begin as the mean over the first batch, not as 0. Where rewards are negative, 0 is
+    more than any state is worth: the policy goes to states that it does not know, until it knows better. That may be
+    what finds a goal, or what several agents take very long to unlearn."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
 

@@ -53,6 +53,7 @@ def default_settings(
     if seats > _FULL_SEATS:
         for collection in (settings["collection"], settings["with_memory"]["collection"]):
             collection["envs_per_actor"] = max(1, collection["envs_per_actor"] * _FULL_SEATS // seats)
+        settings["training"]["mean_first_value"] = True  # a team unlearns late what it explores (docs/results.md)
     if spaces is not None:
         _fit_rollouts(settings, spaces, seats)
     if codes:

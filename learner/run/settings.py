@@ -304,6 +304,7 @@ def unread_settings(spec: RunSpec) -> set[str]:
         "training.value_loss training.value_coefficient": not record.replay,
         "training.entropy_bonus training.entropy_bonus_final training.normalize_advantages": has_returns,
         "training.min_advantage_deviation": has_returns and training.normalize_advantages,
+        "training.mean_first_value": has_returns and not spec.uploads_gradients,
         "training.replay_transitions training.replay_megabytes training.replay_saved training.replay_begin "
         "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate "
         "training.demonstration_share": record.replay,

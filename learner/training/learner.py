@@ -1,5 +1,6 @@
 """The parameters, the optimiser and the policy version, and their updates. No threads, no I/O."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
@@ -129,6 +130,7 @@ def moments_in(gradient: Gradient) -> dict[str, Moments]:
 
 # Names of what actors vote on besides components of observations (algorithms/normalization.py).
 _RETURNS, _REWARDS, _NORM, _METRICS = "returns", "rewards", "gradient norm", "metrics/"
+_LEAST_END = 1e-3  # of 1 - discount factor times what goes on, when the first values are computed: horizons are finite
 _CURIOSITY = "curiosity/"  # beginning of the names of its statistics in checkpoints
 
 _Seen = dict[str, Moments]
@@ -247,6 +249,8 @@ class Learner:
         if self._curiosity is not None:
             self._curiosity.look(rollouts, _annealed(self._spec.curiosity, 0.0, progress))
         batch, kept, seen = self._sorted_out(rollouts)
+        if self._spec.mean_first_value and self.policy_version == 0:
+            self._begin_values(batch)
         with memory_faults(batch.rewards.numel(), lambda: self._fitting(batch)):
             on_device = self.graphs.moved(batch)
             left_out = self.finish()
@@ -254,6 +258,21 @@ class Learner:
             made = self._make_updates(on_device, progress, count)
             self._pending = _Pending(batch, kept, seen, progress, count, made)
             return left_out if self.overlaps else left_out + self.finish()
+
+    def _begin_values(self, batch: Batch) -> None:
+        """Let the values of all states begin as their mean over the first batch, unless weights were loaded.
+
+        The mean of V(s) = r + discount_factor V(s') is r / (1 - discount_factor (1 - p)), with the mean reward r, and
+        the share p of the rows that terminate.
+        """
+        head, rows = self._network.value_head, batch.valid > 0
+        if head is None or float(head.bias.detach()) != 0.0 or not rows.any():
+            return
+        goes_on = 1.0 - float(batch.terminated[rows].float().mean())
+        value = float(batch.rewards[rows].mean()) / max(1.0 - self._spec.discount_factor * goes_on, _LEAST_END)
+        if math.isfinite(value):
+            with torch.no_grad():
+                head.bias.fill_(value)
 
     def _fitting(self, batch: Batch) -> int:
         """Return the number of rows of a batch, by halves of it, whose gradient fits into the memory of the device."""

@@ -149,6 +149,7 @@ def test_rollouts_of_many_seats_are_no_larger(where: Spaces, seats: int, rows: i
     collection, with_memory = settings["collection"], settings["with_memory"]["training"]
     assert (collection["rollout_length"], collection["envs_per_actor"]) == (rows, copies)
     assert not {"curiosity", "entropy_bonus"} & set(with_memory)  # which were measured with one agent
+    assert settings["training"].get("mean_first_value", False) == (seats > 2)
 
 
 def test_components_to_leave_out_become_a_setting() -> None:

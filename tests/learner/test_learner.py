@@ -237,6 +237,29 @@ def test_rates_are_annealed_over_the_budget_and_constant_outside(
     assert [learner.entropy_bonus(share) for share in shares] == pytest.approx(bonuses)
 
 
+@pytest.mark.parametrize(
+    ("settings", "loaded", "value"),
+    [
+        # Of the valid rows, the mean reward is -3, and a quarter terminate: -3 / (1 - 0.8 * 0.75).
+        ({"mean_first_value": True}, 0.0, -7.5),
+        ({"mean_first_value": True, "algorithm": "appo"}, 0.0, -7.5),
+        ({"mean_first_value": True}, 0.25, 0.25),  # the weights of another run
+        ({}, 0.0, 0.0),
+    ],
+)
+def test_values_begin_as_the_mean_over_the_first_batch(settings: dict[str, Any], loaded: float, value: float) -> None:
+    learner = make_learner(discount_factor=0.8, learning_rate=1e-9, **settings)
+    learner.load({**weights(learner), "value_head.bias": np.array([loaded], np.float32)})
+    valid, terminated = np.ones((3, 4), np.bool_), np.zeros((3, 4), np.bool_)
+    valid[2], terminated[0, 1], terminated[1, 2] = False, True, True
+    rewards = np.repeat(np.array([[-2.0], [-4.0], [100.0]], np.float32), 4, 1)
+    for _ in range(2):  # the second batch changes nothing
+        rollout = make_rollout(rows=3, environments=4, rewards=rewards, terminated=terminated, valid=valid)
+        learner.step([rollout], 0.0)
+        assert learner.weights()["value_head.bias"] == pytest.approx([value], abs=1e-4)
+        rewards = rewards - 5.0
+
+
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
 def test_same_seed_gives_identical_weights(algorithm: str) -> None:
     def trained(seed: int) -> dict[str, np.ndarray]:
