@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,7 @@ def test_what_fails_for_one_actor_does_not_fail_for_those_that_share_its_call(se
     try:
         for thread in threads:
             thread.start()
+        time.sleep(0.5)  # so that both wait; on a very slow machine their calls may not be joined
         os.kill(process.process.pid, signal.SIGUSR1)
     finally:
         os.kill(process.process.pid, signal.SIGCONT)
