@@ -339,7 +339,7 @@ class MinariWriter:
         return storage
 
     def add(self, episode: Episode, seed: int | None = None) -> None:
-        """Write an episode. Raises DatasetError, also before a write that would fill the disk and so damage the dataset.
+        """Write an episode. Raises DatasetError, also before a write that would fill the disk and damage the dataset.
 
         After a write that has failed, each call does: HDF5 may then crash the process.
         """
