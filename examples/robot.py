@@ -28,6 +28,7 @@ import logging
 import math
 import multiprocessing
 import signal
+import sys
 import time
 from collections import deque
 from multiprocessing.connection import Connection
@@ -126,6 +127,7 @@ class Person:
 
 def drive(address: str, options: argparse.Namespace, results: Connection) -> None:
     """Run the arm's loop, in a process of its own."""
+    signal.signal(signal.SIGINT, lambda *_: sys.exit(1))  # Ctrl-C, without a traceback
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     arm, person = Camera() if options.camera else Arm(), Person()
     client = Client(

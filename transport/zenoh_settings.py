@@ -18,6 +18,9 @@ _ACCEPT_MILLISECONDS = 5000  # for a new connection to identify itself; then it 
 # Connections that have not identified themselves yet. With Zenoh's default of 100, as many silent connections keep
 # every actor from joining.
 _MOST_PENDING = 4096
+# Batches of 64 kB that wait for a link. A snapshot has many: with Zenoh's default of 2, its sender waits for each. A
+# router has a link to each actor, so it keeps the default.
+_CLIENT_QUEUE = 16
 _DESCRIPTORS = 65_536  # of a process whose limit is not known, such as zenohd
 
 
@@ -69,6 +72,7 @@ def session_settings(
         "transport/link/tx/lease": _LEASE_MILLISECONDS,
         "transport/link/rx/max_message_size": capacity.message_bytes,
         "transport/shared_memory/enabled": False,
+        **({"transport/link/tx/queue/size/data": _CLIENT_QUEUE} if mode == "client" else {}),
         "transport/unicast/max_sessions": capacity.sessions,
         "transport/unicast/accept_pending": capacity.pending,
         "transport/unicast/accept_timeout": _ACCEPT_MILLISECONDS,
