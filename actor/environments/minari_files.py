@@ -379,8 +379,8 @@ class MinariWriter:
             raise DatasetError(self._failure) from None
 
 
-def _update_metadata(path: Path, changes: Mapping[str, Any]) -> None:
-    replace_text(path, json.dumps(json.loads(path.read_bytes()) | dict(changes)))
+def _update_metadata(path: Path, metadata: dict[str, Any]) -> None:
+    replace_text(path, json.dumps(json.loads(path.read_bytes()) | metadata))
 
 
 def _dataset_id(name: str) -> str:
