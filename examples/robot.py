@@ -28,6 +28,7 @@ import logging
 import math
 import multiprocessing
 import signal
+import sys
 import time
 from collections import deque
 from multiprocessing.connection import Connection
@@ -126,6 +127,7 @@ class Person:
 
 def drive(address: str, options: argparse.Namespace, results: Connection) -> None:
     """Run the arm's loop, in a process of its own."""
+    signal.signal(signal.SIGINT, lambda *_: sys.exit(1))  # Ctrl-C, without a traceback
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     arm, person = Camera() if options.camera else Arm(), Person()
     client = Client(
@@ -244,10 +246,12 @@ def main() -> None:
         "--delay-p99", type=float, default=0.2, metavar="SECONDS", help="one piece in a hundred (default: %(default)s)"
     )
     parsed = options.parse_args()
+    target = parsed.address.removeprefix("tcp/")
+    if not target.rpartition(":")[2].isdigit() or "/" in target:
+        options.error(f"{parsed.address} is not tcp/HOST:PORT")
     processes = multiprocessing.get_context("spawn")
     pipe, proxys_pipe = processes.Pipe()
     results, arms_results = processes.Pipe(duplex=False)
-    target = parsed.address.split("/", 1)[1]
     proxy: Any = processes.Process(target=delay_network, args=(target, parsed.delay_p99, proxys_pipe), daemon=True)
     proxy.start()
     address = f"tcp/127.0.0.1:{pipe.recv()}"
@@ -258,6 +262,9 @@ def main() -> None:
         found = results.recv()
     except EOFError:
         raise SystemExit("the arm's process failed") from None
+    except KeyboardInterrupt:
+        arm.join()
+        raise SystemExit("stopped") from None
     arm.join()
     pipe.send(None)
     delays = np.array(pipe.recv())

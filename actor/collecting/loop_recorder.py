@@ -2,6 +2,7 @@
 
 import logging
 import queue
+import tempfile
 import threading
 from typing import Any
 
@@ -20,8 +21,16 @@ class LoopRecorder:
     """Writes the episodes of all agents into one dataset. No call waits for the disk."""
 
     def __init__(self, name: str) -> None:
-        """Begin a dataset; see MinariWriter. Raises DatasetError if it exists, or Minari is not installed."""
-        new_dataset_folder(name)
+        """Begin a dataset; see MinariWriter.
+
+        Raises DatasetError if it exists, or cannot be written, or Minari is not installed.
+        """
+        folder = new_dataset_folder(name)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:  # now, and not after the first episode
+            raise DatasetError(f"dataset {name} cannot be written: {error}") from None
         self._name = name
         self._spaces: tuple[gymnasium.Space, gymnasium.Space] | None = None  # of observations and actions
         self._waiting: queue.SimpleQueue[tuple[Episode, int] | None] = queue.SimpleQueue()

@@ -7,8 +7,10 @@ checked before memory is allocated for them. h5py and minari are the extra `demo
 
 import json
 import math
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
@@ -18,7 +20,7 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.components import LeftOut, leaves, nested, without
-from daedalus.policy.saving.regular_files import read_regular
+from daedalus.policy.saving.regular_files import read_regular, replace_text
 from daedalus.protocol.texts import bounded_text
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
 _METADATA_BYTES = 64 << 20  # the bounds of an image's pixels are listed one by one
 _EPISODE_BYTES = 1 << 30  # of one array of an episode
+_FREE_BYTES = 16 << 20  # of the disk, beside twice an episode, for it to be written
 _DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)) | {"bool"}
 _INSTALL = 'pip install "daedalus-rl[demonstrations]"'
 _ALGORITHM = "algorithm_name"  # of Minari's metadata
@@ -109,10 +112,10 @@ class MinariReader:
             self._file = h5py.File(data / "main_data.hdf5", "r")
         try:
             with self._faults():
-                self._lengths = [self._checked(group) for group in self._groups()]
-            stated = content.get("total_episodes")
-            if stated != len(self._lengths):
-                raise self._error(f"its metadata state {stated} episodes, and it has {len(self._lengths)}")
+                stated, found = content.get("total_episodes"), len(self._file)
+                if stated not in (found, found - 1):  # a writer that was killed had not stated its last one
+                    raise self._error(f"its metadata state {stated} episodes, and it has {found}")
+                self._lengths = [self._checked(group) for group in self._groups(stated)]
             if not self._lengths:
                 raise self._error("it has no episodes")
         except BaseException:
@@ -162,8 +165,8 @@ class MinariReader:
 
     # -------------------------------------------------------------------------------------------- checks
 
-    def _groups(self) -> Iterator["h5py.Group"]:
-        for number in range(len(self._file)):
+    def _groups(self, episodes: int) -> Iterator["h5py.Group"]:
+        for number in range(episodes):
             yield self._member(self._file, f"episode_{number}", is_group=True)
 
     def _checked(self, group: "h5py.Group") -> int:
@@ -320,12 +323,15 @@ class MinariWriter:
         self._name, self.episodes, self.steps = name, 0, 0
         self._spaces, self._env_spec, self._algorithm = (observation_space, action_space), env_spec, algorithm
         self._storage: MinariStorage | None = None
+        self._failure = ""
 
     def _created(self) -> "MinariStorage":
         from minari.dataset.minari_storage import MinariStorage
 
         self.folder.mkdir(parents=True, exist_ok=True)
         storage = MinariStorage.new(self.folder / "data", *self._spaces, self._env_spec, jpeg_encoding=False)
+        # Minari empties the file first: a process that is killed then would lose all episodes.
+        storage.update_metadata = partial(_update_metadata, self.folder / "data" / "metadata.json")
         known = {_ALGORITHM: self._algorithm} if self._algorithm else {}
         storage.update_metadata(
             {"dataset_id": _dataset_id(self._name), "minari_version": metadata.version("minari"), **known}
@@ -333,9 +339,14 @@ class MinariWriter:
         return storage
 
     def add(self, episode: Episode, seed: int | None = None) -> None:
-        """Write an episode. Raises DatasetError."""
+        """Write an episode. Raises DatasetError, also before a write that would fill the disk and damage the dataset.
+
+        After a write that has failed, each call does: HDF5 may then crash the process.
+        """
         from minari.data_collector import EpisodeBuffer
 
+        if self._failure:
+            raise DatasetError(self._failure)
         steps = len(episode.rewards)
         ends = np.zeros((2, steps), np.bool_)
         ends[:, -1] = episode.terminated, episode.truncated
@@ -349,15 +360,27 @@ class MinariWriter:
         )
         with self._faults():
             self._storage = self._storage or self._created()
+            self._check_disk(episode)
             self._storage.update_episodes([buffer])
         self.episodes, self.steps = self.episodes + 1, self.steps + steps
+
+    def _check_disk(self, episode: Episode) -> None:
+        values = zip(self._spaces, (episode.observations, episode.actions), strict=True)
+        size = sum(leaf.of(value).nbytes for space, value in values for leaf in leaves(space, "value"))
+        if shutil.disk_usage(self.folder).free < _FREE_BYTES + 2 * size:
+            raise DatasetError(f"dataset {self._name}: its disk has less than {_FREE_BYTES >> 20} MiB left")
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, ValueError, NotImplementedError) as error:
-            raise DatasetError(f"dataset {self._name} cannot be written: {error}") from None
+        except (OSError, ValueError, RuntimeError) as error:  # as h5py raises
+            self._failure = bounded_text(f"dataset {self._name} cannot be written: {error}", 500)
+            raise DatasetError(self._failure) from None
+
+
+def _update_metadata(path: Path, metadata: dict[str, Any]) -> None:
+    replace_text(path, json.dumps(json.loads(path.read_bytes()) | metadata))
 
 
 def _dataset_id(name: str) -> str:

@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         default=1,
         metavar="N",
-        help="number of actors to start, with the names NAME.1 to NAME.N. One that fails is started again (default: "
+        help="number of actors to start, with --name as NAME.1 to NAME.N. One that fails is started again (default: "
         "%(default)s)",
     )
     add_inference(options)

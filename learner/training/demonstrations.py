@@ -100,7 +100,7 @@ class Cloning:
             return np.nan
         with torch.no_grad():
             parts = [self._log_probs(rows) for rows in _parts(self._held_out)]
-        return float(torch.cat(parts).mean())
+        return float(torch.cat(parts, -1).mean())
 
     def _log_probs(self, rows: np.ndarray) -> Tensor:
         device = self._learned.values.device

@@ -78,6 +78,8 @@ def test_client_records_what_is_played(learner: ScriptedLearner, tmp_path: Path)
     np.testing.assert_array_equal(second.observations[:, 0], [2.0, 2.0])  # nothing follows a termination
     with pytest.raises(DatasetError, match="exists at"):
         Client("tcp/127.0.0.1:1", **SPACES, record=place)
+    with pytest.raises(DatasetError, match=r"cannot be written: .*Not a directory"):
+        Client("tcp/127.0.0.1:1", **SPACES, record=place / "data/metadata.json/below")
 
 
 def test_client_may_wait_for_ever(learner: ScriptedLearner) -> None:

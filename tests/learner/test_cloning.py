@@ -37,9 +37,9 @@ def learner_of(**training: Any) -> Learner:
     return Learner(spec, PolicySpec(hidden=(16,), normalize_observations=True), SPACES)
 
 
-def demonstrations() -> ReplayBuffer:
-    buffer = ReplayBuffer(SPACES, ROWS, ROWS * ENVIRONMENTS * 6)
-    for seed in range(6):
+def demonstrations(rollouts: int = 6) -> ReplayBuffer:
+    buffer = ReplayBuffer(SPACES, ROWS, ROWS * ENVIRONMENTS * rollouts)
+    for seed in range(rollouts):
         buffer.add(shown(seed))
     return buffer
 
@@ -52,6 +52,12 @@ def test_the_policy_imitates_what_it_is_shown_before_the_first_update() -> None:
     assert after > before + 1.5  # of actions that it did not learn from
     assert learner.policy_version == 0
     assert learner_of(cloning_updates=300).clone() == ""  # nothing is shown
+
+
+def test_the_held_out_actions_may_be_more_than_a_minibatch() -> None:
+    learner = learner_of(cloning_updates=1)
+    learner.learn_from(demonstrations(rollouts=67))  # 419 are held out: two parts of unequal sizes
+    assert "held out" in learner.clone()
 
 
 def test_the_imitation_ends_when_the_run_is_stopped() -> None:

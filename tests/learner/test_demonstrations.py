@@ -6,6 +6,7 @@ import pickle
 import shutil
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
 
-from daedalus.actor.environments.minari_files import Episode, MinariReader, MinariWriter
+from daedalus.actor.environments.minari_files import DatasetError, Episode, MinariReader, MinariWriter
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.launch import dataset_import
 from daedalus.launch.dataset_import import write_demonstrations
@@ -142,6 +143,39 @@ def test_minari_reads_what_is_recorded(tmp_path: Path) -> None:
             np.testing.assert_array_equal(found.observations, recorded.observations)
             np.testing.assert_array_equal(found.actions, recorded.actions)
             np.testing.assert_array_equal(found.rewards, recorded.rewards)
+
+
+def test_what_is_recorded_survives_a_kill_and_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    environment, name = gymnasium.make("Pendulum-v1"), str(tmp_path / "shown")
+    writer = MinariWriter(name, environment.observation_space, environment.action_space)
+    episode = Episode(np.zeros((2, 3), np.float32), np.zeros((1, 1), np.float32), np.zeros(1), True, False)
+    writer.add(episode)
+    metadata, data = tmp_path / "shown/data/metadata.json", tmp_path / "shown/data/main_data.hdf5"
+    before = metadata.read_text()
+    with metadata.open() as seen:
+        writer.add(episode)
+        assert seen.read() == before, "a reader, or whoever comes after a kill, finds the old metadata or the new ones"
+    metadata.write_text(before)  # as if killed before the second episode was stated
+    with MinariReader(name) as dataset:
+        assert (dataset.episodes, len(list(dataset))) == (1, 1)
+    writer.add(episode)
+    size = data.stat().st_size
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1 << 20))
+        with pytest.raises(DatasetError, match="less than 16 MiB left"):
+            writer.add(episode)
+    assert data.stat().st_size == size
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.File, "__exit__", failing)
+        with pytest.raises(DatasetError, match="cannot be written: no space"):
+            writer.add(episode)
+    with pytest.raises(DatasetError, match="cannot be written: no space"):  # HDF5 may crash if it goes on
+        writer.add(episode)
+
+
+def failing(file: h5py.File, *_: object) -> None:
+    file.close()
+    raise RuntimeError("no\nspace")  # as h5py reports a full disk
 
 
 def change(dataset: Path, kind: str) -> None:
