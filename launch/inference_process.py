@@ -275,7 +275,7 @@ def main() -> int:
     if parsed.exit_with_parent:
         exit_with_parent(stop)
     raise_descriptor_limit()  # an actor has three
-    threads = max((os.cpu_count() or 1) // 2, 1)  # actors that wait leave their cores
+    threads = max(len(os.sched_getaffinity(0)) // 2, 1)  # actors that wait leave their cores
     Inference(parsed.device, threads, stop).serve(parsed.path)
     return 0
 

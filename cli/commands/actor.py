@@ -78,8 +78,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--runtime",
         choices=("onnx", "torch"),
-        default="onnx",
-        help="library that runs the policy (default: %(default)s, which needs no torch)",
+        help="library that runs the policy (default: onnx, which needs no torch; torch with --inference cuda)",
     )
     _add_connection(options)
     options.add_argument(
@@ -160,7 +159,7 @@ def actor_options(arguments: argparse.Namespace) -> ActorOptions:
         any_run=arguments.any_run,
         seats=tuple(arguments.seat),
         environments=arguments.envs,
-        runtime=arguments.runtime,
+        runtime=arguments.runtime or "onnx",
         inference_at=arguments.inference_at,
         link=arguments.link,
         timeout=arguments.timeout,
@@ -188,6 +187,8 @@ def _run_group(arguments: argparse.Namespace) -> int:
             raise ValueError(f"--actors is {arguments.actors}: choose a number from 1 to {_MOST_ACTORS}")
         if arguments.evaluator and arguments.inference != "local":
             raise ValueError("--inference is for actors, and an evaluator runs its own policy: leave it out")
+        if arguments.inference == "cuda" and arguments.runtime == "onnx":
+            raise ValueError("--inference cuda runs the policy with torch: leave out --runtime onnx")
         check_inference(arguments.inference)
         credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
         identity, numbers = credentials.name if credentials else "", range(1, arguments.actors + 1)

@@ -31,6 +31,11 @@ Start = Callable[..., Running]
         ),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs is 0: choose a number from 1 to 4096"),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--actors", "0"], 2, r"--actors is 0: choose a number from 1"),
+        (
+            ["actor", "--connect", "tcp/127.0.0.1:1", "--inference", "cuda", "--runtime", "onnx"],
+            2,
+            r"--inference cuda runs the policy with torch: leave out --runtime onnx",
+        ),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--name", "a/b"], 2, r"actor name 'a/b' must be"),
         (["trian"], 2, r"unknown command 'trian': did you mean train"),
     ],
