@@ -95,7 +95,7 @@ class Curiosity:
     noise that hides the rewards of the environment. Where each episode has another map, this term alone explores as
     well as together with the prediction errors that it was added to at first: Wang et al. (2023), "Revisiting Intrinsic
     Reward for Exploration in Procedurally Generated Environments". Where nearly every observation is new, the term
-    would reward long episodes alone: after the first rows it is 0 for good.
+    would reward long episodes alone: after the first rows it is 0, until the run is resumed.
     """
 
     def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Several actors of one command (`daedalus actor --actors N`), as supervised processes."""
+"""The processes that `daedalus actor --actors N` starts and watches: the actors, and that of their policy."""
 
 import logging
 import os
@@ -47,7 +47,7 @@ class ActorGroup:
         self._inference: Inference = inference
         self._actors: list[Supervised] = []
         self._leave = threading.Event()
-        self._leaving = False  # whether the actors were told
+        self._leaving = False  # whether each actor has been told to leave
 
     def leave(self, _stop: threading.Event) -> None:
         """Let the actors finish and upload their rollouts, and end; from any thread."""

@@ -20,7 +20,7 @@ from daedalus.launch.process_lifecycle import FAILED, STOPPED, interrupts_held
 _logger = logging.getLogger(__name__)
 
 GATEWAY, INFERENCE = "gateway", "the inference process"  # names of processes
-Inference = Literal["local", "shared", "cuda"]  # where the policies of actors run: see docs/operations.md
+Inference = Literal["local", "shared", "cuda"]  # where the policies of actors run: see docs/deploy.md
 # Exit status that means something for a learner only.
 _LEARNERS_RESTARTS = {STOPPED: "was stopped by a signal"}
 # Signals of a process that crashes by itself. Others come from outside: an operator, or the system.

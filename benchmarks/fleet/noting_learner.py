@@ -94,7 +94,7 @@ def note_publications(path: str) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "--no-gradients":
         del sys.argv[1]
-        Learner._make_updates = lambda *_: None  # type: ignore[method-assign]
+        Learner._make_updates = lambda *_: None  # type: ignore[method-assign] - only in this process
         threading.Thread(target=Stages().note, args=(sys.argv.pop(1),), daemon=True).start()
     else:
         note_publications(sys.argv.pop(1))

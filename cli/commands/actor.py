@@ -69,8 +69,8 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         default=1,
         metavar="N",
-        help="number of actors to start, with --name as NAME.1 to NAME.N. One that fails is started again (default: "
-        "%(default)s)",
+        help="number of actors to start, with --name as NAME.1 to NAME.N. One that ends is started again, unless it "
+        "is done or fails in its first minute (default: %(default)s)",
     )
     add_inference(options)
     options.add_argument("--inference-at", metavar="PATH", help=argparse.SUPPRESS)  # for the actors of a group

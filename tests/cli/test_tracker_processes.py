@@ -33,6 +33,8 @@ def offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
     monkeypatch.setenv("HOME", str(tmp_path))  # no ~/.netrc with a key
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    # The process ends itself a minute after the run, which is too short for one that all others go before.
+    monkeypatch.setattr(tracker_processes, "_NICENESS", 0)
 
 
 def log(
@@ -63,7 +65,6 @@ def test_local_files_have_settings_metrics_and_summary_and_a_resumed_run_keeps_i
 ) -> None:
     pytest.importorskip(name) if name != "mlflow" else pytest.importorskip("mlflow.version")
     monkeypatch.setattr(tracker_processes, "_FINISH_SECONDS", LIMIT)
-    monkeypatch.setattr(tracker_processes, "_NICENESS", 0)  # the process ends itself a minute after the run
     settings = ['environment.kwargs."a*b/c"=3']  # MLflow takes no such name
     directory = record(tmp_path / "run", seed=5, settings=settings, solved=True, evaluation=490.0)
     (shown,) = log(directory, name)
@@ -93,7 +94,6 @@ def test_without_a_login_wandb_records_offline_and_says_what_to_do(
 ) -> None:
     pytest.importorskip("wandb")
     monkeypatch.setattr(tracker_processes, "_FINISH_SECONDS", LIMIT)
-    monkeypatch.setattr(tracker_processes, "_NICENESS", 0)  # the process ends itself a minute after the run
     monkeypatch.delenv("WANDB_MODE")
     directory = record(tmp_path / "run")
     (shown,) = log(directory, "wandb")
@@ -150,7 +150,6 @@ def test_a_tracker_that_fails_is_reported(
     code: str, reason: str, package: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tracker_processes, "_FINISH_SECONDS", LIMIT)
-    monkeypatch.setattr(tracker_processes, "_NICENESS", 0)  # the process ends itself a minute after the run
     directory = package(code)
     shown = log(directory, "wandb")
     assert [reason in line for line in shown] == ([True] if reason else [])
