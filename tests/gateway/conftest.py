@@ -6,9 +6,18 @@ from typing import Any
 
 import pytest
 from gateways import JsonClient, RunningGateway
+from processes import LIMIT
 from scripted_learner import ScriptedLearner
 
+from daedalus.gateway.watching import playing_process
 from daedalus.transport.memory import MemoryNetwork
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the end of a process as long as a busy machine may take."""
+    monkeypatch.setattr(playing_process, "_END_SECONDS", LIMIT)
+    monkeypatch.setattr(playing_process, "_KILLED_SECONDS", LIMIT)
 
 
 @pytest.fixture

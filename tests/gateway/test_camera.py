@@ -23,7 +23,6 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
 from daedalus.gateway.learner_link import NewestPolicy
-from daedalus.gateway.watching import playing_process
 from daedalus.gateway.watching.camera import CameraProcess
 from daedalus.gateway.watching.playing_process import PolicySource, frame
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
@@ -34,13 +33,6 @@ from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 COMMAND = (sys.executable, "-P", "-m", "daedalus.launch.camera_process")
 STATE = np.zeros((3, 0), np.float32)
-
-
-@pytest.fixture(autouse=True)
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for the end of a process as long as a busy machine may take."""
-    monkeypatch.setattr(playing_process, "_END_SECONDS", LIMIT)
-    monkeypatch.setattr(playing_process, "_KILLED_SECONDS", LIMIT)
 
 
 def weights() -> dict[str, np.ndarray]:
