@@ -57,8 +57,8 @@ def test_slow_actors_wait_for_a_stopped_learner_and_leave_a_finished_run(start: 
     learner.process.terminate()
     assert learner.wait() == 0, learner.output
     saved = learner.expect(r"stopped; checkpoint saved at ([\d,]+) env_steps: run/checkpoints/0").group(1)
-    for actor in actors:
-        actor.expect("the learner was stopped; waiting for it to return")
+    for actor in actors:  # what the learner says last is lost if its router ends before a busy machine has sent it
+        actor.expect("the learner was stopped; waiting for it to return|the learner went away; looking for it again")
     resumed = start(*words, "--env-steps", int(saved.replace(",", "")) + 600, "--resume")
     resumed.expect("resuming from checkpoint")
     assert resumed.wait() == 0, resumed.output
