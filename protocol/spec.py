@@ -507,6 +507,9 @@ class LeagueSpec(Specification):
     choice: Literal["uniform", "prioritized"] = "uniform"
     """Which past version to play: any, or more often those that win about half of their matches: in proportion to
     p (1 - p) of the probability p to beat it."""
+    openings: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """Begin each match with random legal actions of all agents, for a number of env_steps that is drawn from 0 to this.
+    They do not count as env_steps and are not learned from. A match that would end in its opening has none."""
     keep_env_steps: PositiveInt | None = None
     """Keep a version after this many env_steps. Unset: a fiftieth of `training.env_steps`."""
     versions: Annotated[int, Field(ge=1, le=256)] = 20

@@ -82,6 +82,7 @@ class EnvironmentCollector:
         except UserModuleError as error:
             raise EnvironmentSetupError(str(error)) from None
         games = self._games(spec, count)
+        games.openings = spec.league.openings
         try:
             self.lineup = Lineup(
                 spec.league,

@@ -453,7 +453,8 @@ class SeatWriter(RolloutWriter):
         # A column may go on with another seat after a row that resets.
         seats = (observed.acting & (self._lineup.column >= 0)).nonzero()[0]
         columns = self._lineup.column[seats]
-        written = self._writing[columns]
+        # An episode that ends before its first action has no rows: the row that resets goes on to the next one.
+        written = self._writing[columns] & ~(self._resets[columns] & (terminated | truncated)[seats])
         seats, columns = seats[written], columns[written]
         rows, valid = self._rows[columns], ~self._resets[columns]
         for name, frames in self._frames.items():

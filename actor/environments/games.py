@@ -81,6 +81,7 @@ class GameEnvironments:
         self._warned = False
         self.resting = np.zeros(len(copies), np.bool_)  # copies that do not begin another match
         self._abandoned = np.zeros(len(copies), np.bool_)  # copies whose match goes on, but not here
+        self.openings = 0  # see LeagueSpec
         self._episode_info = EpisodeInfo()
         self._camera: Camera | None = None
         self.acting = np.zeros(self.count, np.bool_)
@@ -123,19 +124,34 @@ class GameEnvironments:
         self._ended[:] = self._acts[:] = False
         for number in range(len(self._games)):
             self._random[number] = np.random.default_rng(seed + number)
-            self._begin_match(number)
-            self._note(number, self._call("reset", number, seed + number))
+            self._note(number, self._begin_match(number, seed + number))
         self.acting &= ~self._ended  # an episode that ends before its first action has no beginning
         self._film()
         return self.observations
 
-    def _begin_match(self, number: int) -> None:
+    def _begin_match(self, number: int, seed: int | None) -> list[Outcome]:
+        """Reset a copy, play its opening, and return what is new for the agents that have seats."""
         self._abandoned[number] = False
         for agent, place in self._numbers.items():
             seat = number * self.seats + place
             bot = self._in_match[seat] = self._bots[seat]
             if bot is not None:
                 bot.reset(agent, int(self._random[number].integers(2**31)))
+        outcomes = self._call("reset", number, seed)
+        game, left = self._games[number], list[Outcome]()  # of agents that have left in the opening
+        moves = int(self._random[number].integers(self.openings + 1)) if self.openings else 0
+        for _ in range(moves):
+            newest = {outcome.agent: outcome for outcome in outcomes}
+            chosen = {
+                agent: self._random_action(number, agent, newest[agent].observation, newest[agent].info)
+                for agent in game.turns
+            }
+            outcomes = self._call("step", number, chosen)
+            if game.is_over:
+                return self._call("reset", number, None)
+            left += [outcome for outcome in outcomes if outcome.terminated or outcome.truncated]
+        newest = {outcome.agent: outcome for outcome in (*left, *outcomes)}
+        return [outcome._replace(reward=0.0) for outcome in newest.values()] if moves else outcomes
 
     def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments. The actions of seats that were not acting have no effect."""
@@ -147,8 +163,7 @@ class GameEnvironments:
             if self._abandoned[number] or game.is_over:
                 if self.resting[number]:
                     continue
-                self._begin_match(number)
-                outcomes = self._call("reset", number, None)
+                outcomes = self._begin_match(number, None)
             else:
                 first = number * self.seats
                 chosen = {agent: self._chosen(actions, first + self._numbers[agent]) for agent in game.turns}

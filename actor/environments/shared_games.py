@@ -168,6 +168,11 @@ class SharedGames:
             return seats
 
     def _check(self, run: str, spec: ActorSpec) -> None:
+        if spec.league.openings:
+            raise EnvironmentSetupError(
+                f"the run {run!r} sets league.openings, but games that several runs share have no random openings: "
+                "unset it"
+            )
         for other, before in self._joined.items():
             for name in _MADE_FROM:
                 own, theirs = getattr(spec.environment, name), getattr(before.environment, name)

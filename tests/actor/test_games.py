@@ -79,6 +79,7 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
             rollout = collect(collector)
             assert rollout.environments == alone * agents + (copies - alone) * side
             frames, steps = rollout.frames["observation"], set()
+            assert (rollout.valid[1:] != (rollout.terminated | rollout.truncated)[:-1]).all()
             for column in range(rollout.environments):
                 copy = column // agents if column < alone * agents else alone + (column - alone * agents) // side
                 for row in np.flatnonzero(rollout.valid[:, column]):
@@ -150,6 +151,66 @@ def check_results(results: list[MatchCount], totals: dict[int, list[float]], gam
         counted[each.side] += each.wins, each.draws, each.losses
     assert (counted <= most).all()
     assert finished - len(games) <= counted.sum() <= finished  # the newest match of a game may go on
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    agents=st.integers(1, 4),
+    kind=st.sampled_from(["Turns", "Together"]),
+    openings=st.integers(1, 20),
+)
+def test_rows_after_random_openings_are_those_of_a_slow_account(
+    seed: int, agents: int, kind: str, openings: int
+) -> None:
+    spec = EnvironmentSpec(id=f"scripted_games:{kind}", backend="pettingzoo", kwargs={"seed": seed, "agents": agents})
+    scripted_games.PLAYED.clear()
+    league = LeagueSpec(past_share=0.0, opponents={}, rating_share=0.0, openings=openings)
+    collector = started_collector(spec, Counting(), rollout_length=20, league=league)
+    learned, steps, counted = set(), set[tuple[int, int]](), 0
+    try:
+        for _ in range(ROLLOUTS):
+            rollout = collect(collector)
+            frames = rollout.frames["observation"]
+            counted += rollout.env_steps
+            assert (rollout.valid[1:] != (rollout.terminated | rollout.truncated)[:-1]).all()
+            for row, column in np.argwhere(rollout.valid):
+                match, agent, number = (int(number) for number in frames[row, column])
+                account = scripted_games.rows(seed, match, agents, together=kind == "Together")
+                wanted = account[match, agent, number]
+                found = rollout.rewards[row, column], rollout.terminated[row, column], rollout.truncated[row, column]
+                assert found == (wanted.reward, wanted.terminated, wanted.truncated)
+                if not (wanted.terminated or wanted.truncated):
+                    assert tuple(frames[row + 1, column]) == (match, agent, number + 1)
+                assert (match, agent, number) not in learned
+                if row and number and (match, agent, number - 1) not in learned:
+                    assert account[match, agent, number - 1].step < openings
+                learned.add((match, agent, number))
+                steps.add((match, wanted.step))
+    finally:
+        collector.close()
+    played = {
+        (match, scripted_games.rows(seed, match, agents, together=kind == "Together")[match, agent, number].step)
+        for _, (match, agent, number) in scripted_games.PLAYED
+    }
+    assert counted < len(played)
+
+
+def test_openings_have_every_length_up_to_the_largest() -> None:
+    spec = EnvironmentSpec(id="scripted_games:Together", backend="pettingzoo", kwargs={"seed": 1, "agents": 1})
+    league = LeagueSpec(past_share=0.0, opponents={}, rating_share=0.0, openings=3)
+    collector = started_collector(spec, Counting(), count=8, rollout_length=100, league=league)
+    rollout = collect(collector)
+    collector.close()
+    matches, _, numbers = rollout.frames["observation"][:-1].transpose(2, 0, 1).astype(int)
+    firsts = [
+        numbers[rollout.valid[:, column] & (matches[:, column] == match), column].min()
+        for column in range(8)
+        for match in np.unique(matches[rollout.valid[:, column], column])
+    ]
+    shares = np.bincount(firsts, minlength=4) / len(firsts)
+    assert len(shares) == 4
+    assert shares.min() > 0.05  # a match that ends in its opening begins again without one
 
 
 class Always(PlainPolicy):

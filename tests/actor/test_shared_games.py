@@ -52,12 +52,13 @@ def run_spec(kind: str, seed: int, agents: int, plays: tuple[str, ...], **change
         "agents": plays,
     }
     collection = {"envs_per_actor": changes.pop("copies", 1), "rollout_length": changes.pop("length", 3)}
+    league = {"sides": [plays] if plays else [], "openings": changes.pop("openings", 0)}
     return RunSpec.model_validate(
         {
             "environment": environment,
             "collection": collection,
             "training": changes,
-            "league": {"sides": [plays] if plays else []},
+            "league": league,
         }
     ).for_actors()
 
@@ -173,6 +174,7 @@ def joined(first: ActorSpec, second: ActorSpec, seats: dict[str, tuple[str, ...]
         ({"plays": ("agent_0", "agent_1")}, "--seat gives agent_1 to the run 'two', .* are agent_0, agent_1"),
         ({"plays": ()}, "--seat gives agent_1 to the run 'two', .* are agent_0, agent_1"),
         ({"algorithm": "a2c"}, "could wait for each other"),
+        ({"openings": 2}, "the run 'two' sets league.openings, .* unset it"),
     ],
 )
 def test_runs_that_do_not_fit_together_are_refused(change: dict[str, Any], reason: str) -> None:
