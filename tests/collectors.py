@@ -8,6 +8,7 @@ from allowed_modules import TEST_MODULES
 from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.vector_environments import VectorEnvironment
+from daedalus.learner.serving.rollout_judge import episode_violation
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.lessons import LessonPlan, LessonSpec
@@ -55,5 +56,8 @@ def snapshot(policy_version: int, weights: dict[str, np.ndarray], lessons: Lesso
 
 
 def collect(collector: EnvironmentCollector) -> Rollout:
-    """The collector's next rollout; its arrays are valid until the one after it."""
-    return collector.collect(IDENTITY)
+    """The collector's next rollout, which a learner must accept; its arrays are valid until the one after it."""
+    rollout = collector.collect(IDENTITY)
+    assert not (refused := episode_violation(rollout)), refused
+    assert rollout.game_steps is None or rollout.game_steps <= 2 * rollout.agent_steps
+    return rollout

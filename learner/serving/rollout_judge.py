@@ -274,7 +274,7 @@ class RolloutJudge:
             or first_component_violation(rollout, spaces, self._spec.policy)
             or number_violation(rollout)
             or self._value_violation(rollout)
-            or _episode_violation(rollout, self._spec.algorithm.learns_overrides)
+            or episode_violation(rollout, self._spec.algorithm.learns_overrides)
             or lessons_violation(rollout, self._spec)
         )
 
@@ -317,7 +317,7 @@ def _matches(upload: Upload) -> int:
     return sum(each.wins + each.draws + each.losses for each in counts)
 
 
-def _episode_violation(rollout: Rollout, teaches: bool = False) -> str:
+def episode_violation(rollout: Rollout, teaches: bool = False) -> str:
     """Return where the rollout breaks gymnasium's NEXT_STEP rule, or reports other episodes than ended in it.
 
     `teaches`: the run learns from overridden rows.

@@ -10,7 +10,7 @@ from test_client_collector import IDENTITY, ROWS, Played, Robot, run_spec, synch
 
 from daedalus.actor.collecting.client_agent import ClientAgent
 from daedalus.actor.collecting.client_collector import ClientCollector
-from daedalus.learner.serving.rollout_judge import _episode_violation
+from daedalus.learner.serving.rollout_judge import episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -77,7 +77,7 @@ def test_agents_of_a_loop_do_not_disturb_each_other() -> None:
     order = [index for index in range(AGENTS) for rollout in after_each_other if of_agent(rollout) == index]
     assert set(order) == set(range(AGENTS))
     for rollout in after_each_other:
-        assert _episode_violation(rollout) == ""
+        assert episode_violation(rollout) == ""
         assert any(_equal(rollout, other) for other in in_turn), "no agent made this rollout when they acted in turn"
 
 
@@ -110,7 +110,7 @@ def test_synchronous_run_receives_the_rollouts_of_all_agents_as_one() -> None:
         step(client.agents[-1], robots[-1])
     rollout = take(client)
     assert (rollout.rows, rollout.environments) == (ROWS, AGENTS)
-    assert _episode_violation(rollout) == ""
+    assert episode_violation(rollout) == ""
     (frames,) = rollout.frames.values()
     assert frames[0, :, 1].tolist() == [0.0] * AGENTS  # the first step of every agent
     lengths = [length for ends in ENDS for length in _finished(ends)]

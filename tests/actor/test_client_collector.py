@@ -18,7 +18,7 @@ from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.errors import ActorError
-from daedalus.learner.serving.rollout_judge import _episode_violation
+from daedalus.learner.serving.rollout_judge import episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -228,7 +228,7 @@ def test_rows_between_the_rollouts_of_a_synchronous_run_are_not_written() -> Non
     assert first.initial_state.any(), "the memory began before the rollout"
     assert client.dropped == 0
     for rollout in (first, second):
-        assert _episode_violation(rollout) == ""
+        assert episode_violation(rollout) == ""
 
 
 def observations(count: int) -> np.ndarray:
@@ -280,7 +280,7 @@ def test_a_run_that_learns_from_people_gets_what_they_played() -> None:
     assert first.taught.all()
     assert not first.learned.any()
     assert first.actions["action"][:, 0, 0].tolist() == [step % 4 for step in range(ROWS)]
-    assert (_episode_violation(first, True), second.taught) == ("", None)
+    assert (episode_violation(first, True), second.taught) == ("", None)
     assert second.learned[:, 0].tolist() == [True, True, False, True, True]
 
 

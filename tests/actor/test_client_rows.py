@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.learner.serving.rollout_judge import _episode_violation
+from daedalus.learner.serving.rollout_judge import episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -76,7 +76,7 @@ class Loop:
 
 def check(rollout: Rollout) -> None:
     """Each row must have the reward of its own observation, and each episode its own frames."""
-    assert _episode_violation(rollout) == ""
+    assert episode_violation(rollout) == ""
     frames = rollout.frames["observation"]  # [1 + ROWS + 1, 1, 2]
     stacks = np.zeros((ROWS + 1, 1, 2, 2), np.float32)
     stack_rows(frames, rollout.valid, stacks)
