@@ -98,12 +98,12 @@ def test_an_algorithm_that_is_no_text_is_refused_in_one_line(tmp_path: Path) -> 
 def test_default_settings_of_a_policy_with_memory_have_fewer_updates_unless_they_are_chosen() -> None:
     words = ["--env", "CartPole-v1", "--set", "policy.memory=gru"]
     spec = spec_of(*words)
-    assert (spec.training.passes, spec.training.minibatches, spec.collection.rollout_length) == (4, 4, 32)
+    assert (spec.training.passes, spec.training.minibatches, spec.collection.rollout_length) == (4, 8, 32)
     assert (spec.policy.memory_units, spec.training.curiosity) == (64, 1.0)
     spec = spec_of(*words, "--algorithm", "a3c", "--set", "collection.upload=gradients")
     assert spec.training.curiosity == 0.0  # which gradients do not tell
     spec = spec_of(*words, "--set", "training.passes=2")
-    assert (spec.training.passes, spec.training.minibatches) == (2, 4)
+    assert (spec.training.passes, spec.training.minibatches) == (2, 8)
     spec = spec_of(*(words[:2]))
     assert (spec.training.passes, spec.collection.rollout_length) == (10, 128)
 
