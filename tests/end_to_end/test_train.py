@@ -265,7 +265,7 @@ def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path) -> N
     noise = "        print('noise'); self._step or os.system('echo from a process')\n"
     noisy = source.replace("        self._step += 1\n", f"{noise}        self._step += 1\n")
     (tmp_path / "my_module.py").write_text(noisy.replace("import gymnasium\n", "import os\nimport gymnasium\n", 1))
-    running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, "--run-dir", "own")
+    running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, *SHORT, "--run-dir", "own")
     assert running.wait() == 0, running.output
     assert running.lines.count("noise") < 200
     running.expect(r"[\d,]+ lines of output were not shown; see own/output.log")
