@@ -217,9 +217,11 @@ class LearnerService:
             lost = True
             raise
         finally:
-            ended = ended or time.monotonic()
+            trained, ended = ended is not None, ended or time.monotonic()
             try:
                 server.close(_FINISHED if finished else self._why_stopped, finished=finished)
+                if trained:
+                    loop.keep_received()
                 if not lost:
                     saving = checkpointer.begin(last=True)  # it is written while the last metrics are
                     reporter.record(learner, ended, last=True)

@@ -146,6 +146,16 @@ class TrainingLoop:
         self._settle()
         return time.monotonic()
 
+    def keep_received(self) -> None:
+        """Let a replay buffer have the rollouts that were accepted, but not yet taken, when the run was stopped."""
+        rollouts = self._server.rollouts
+        while self._context.spec.algorithm.replay and not self._context.is_finished:
+            batch = rollouts.take_batch(self._learner.policy_version)
+            if not batch:
+                return
+            left_out = self._learn_from(batch, self._context.progress)
+            rollouts.count_trained(batch, left_out, self._learner.far_outside)
+
     def _reaches_target(self) -> bool:
         """Return whether the target is reached for the first time, and new episodes confirm it if they are played."""
         if self._counters.seconds_to_target is not None:

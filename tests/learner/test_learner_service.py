@@ -33,6 +33,7 @@ from daedalus.learner.serving.events import read_events
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.training.checkpoint import Checkpoint, load_newest
 from daedalus.learner.training.learner import Learner
+from daedalus.learner.training.replay_learner import ReplayLearner
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score, keep_if_best
 from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, read_policy
 from daedalus.protocol import keys
@@ -221,6 +222,43 @@ def test_every_algorithm_trains_with_frame_stacks_and_recurrent_policy(tmp_path:
     assert updates % (4 if algorithm == "appo" else 1) == 0
     summary = json.loads((training_run.directory / "summary.json").read_text())
     assert "malformed" not in summary["rollouts_rejected"]
+
+
+def test_a_replay_buffer_has_all_rollouts_that_were_accepted_before_a_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, kept, is_busy, goes_on = ReplayLearner.step, list[Rollout](), threading.Event(), threading.Event()
+
+    def slow(learner: ReplayLearner, rollouts: Sequence[Rollout], progress: float) -> Any:
+        kept.extend(rollouts)
+        if len(kept) == 3:
+            is_busy.set()
+            goes_on.wait(LIMIT)
+        return step(learner, rollouts, progress)
+
+    monkeypatch.setattr(ReplayLearner, "step", slow)
+    training_run = TrainingRun(
+        tmp_path,
+        environment={"id": "Pendulum-v1"},
+        policy={"hidden": [8], "distribution": "squashed_gaussian", "state_dependent_std": True},
+        collection={"actors": 1, "envs_per_actor": 1, "rollout_length": 4},
+        training={"algorithm": "sac", "replay_transitions": 100, "minibatch_rows": 8, "env_steps": 10**9},
+    )
+    try:
+        assert is_busy.wait(LIMIT)
+        with closing(MemoryTransport(training_run.network)) as observer:
+
+            def accepted() -> int:
+                report = decode(observer.query(keys.status("run"), timeout=LIMIT)[0], Limits())
+                assert isinstance(report, StatusReport)
+                return report.status.rollouts_accepted
+
+            until(lambda: accepted() == 5)  # two wait
+        training_run.stop.set()
+    finally:
+        goes_on.set()
+        training_run.end()
+    assert len(kept) == read_json(training_run.directory / "summary.json")["rollouts_accepted"] >= 5
 
 
 def test_what_is_known_of_a_batch_late_is_in_the_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
