@@ -9,7 +9,19 @@ import argparse
 import sys
 import time
 
-from benchmarks.chaos import actors, clocks, disk, endings, league_results, learners, network, orders, slow, wire
+from benchmarks.chaos import (
+    actors,
+    clocks,
+    disk,
+    endings,
+    league_results,
+    learners,
+    network,
+    orders,
+    replay,
+    slow,
+    wire,
+)
 from benchmarks.chaos.scene import FailedError, say
 from benchmarks.running import machine, table
 
@@ -29,6 +41,7 @@ def main() -> int:
         "freezes": lambda: actors.freezes(scaled(20)),
         "accounting": lambda: actors.accounting(scaled(30)),
         "league": lambda: league_results.league(scaled(40)),
+        "replay": lambda: replay.replay(scaled(40)),
         "learners": lambda: learners.kills(scaled(50)),
         "ends": lambda: endings.run_ends(scaled(100)),
         "restarts": lambda: endings.restarts(scaled(100)),
@@ -44,6 +57,7 @@ def main() -> int:
         "subscriber": lambda: wire.slow_subscriber(max(20.0 * arguments.scale, 5.0)),
         "clocks": lambda: clocks.steps(max(10.0 * arguments.scale, 3.0)),
         "slow": lambda: slow.slow(max(600.0 * arguments.scale, 150.0)),
+        "simulators": lambda: replay.simulators(scaled(3)),
         "fuzz": lambda: wire.fuzz(scaled(1_000_000)),
         "solve": lambda: actors.solve(scaled(3)),
     }
