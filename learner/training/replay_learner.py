@@ -42,9 +42,11 @@ class ReplayLearner(Learner):
         super().__init__(spec, run.policy, spaces, modules)
         algorithm = self._gradients.algorithm
         assert isinstance(algorithm, Sac)
-        mixed = is_mixed(spec.precision, self.device, self._network.convolutional)
+        network = self._network
+        gains = network.convolutional or (self.device.type == "cpu" and not network.has_user_modules)
+        mixed = is_mixed(spec.precision, self.device, gains)
         critics = TwinCritics(run.policy, spaces, modules).to(self.device)
-        algorithm.build(critics, self._network, self._flat, target_rate=spec.target_rate, is_mixed=mixed)
+        algorithm.build(critics, network, target_rate=spec.target_rate, is_mixed=mixed)
         self._algorithm = algorithm
         self._learned = {"policy": self._flat.values, **algorithm.learned}
         self._optimizers = {
@@ -66,6 +68,11 @@ class ReplayLearner(Learner):
         """See Learner. The critics get the convolutions of the policy."""
         super().load(parameters)
         self._algorithm.take_convolutions()
+
+    def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
+        """See Learner."""
+        self._algorithm.continue_from([name.removeprefix("algorithm/") for name in state])
+        super().restore(version, parameters, state)
 
     def learn_from(self, demonstrations: ReplayBuffer) -> None:
         """See Learner: they are a share of each minibatch."""

@@ -38,16 +38,16 @@ SPACES = spaces_of(arm=ARM, leg=LEG)
 class Built:
     """Sac, and the parts that the learner joins it with."""
 
-    def __init__(self, seed: int = 1, **training: Any) -> None:
+    def __init__(self, seed: int = 1, *, is_mixed: bool = False, **training: Any) -> None:
         torch.manual_seed(seed)
         spec = TrainingSpec.model_validate({"algorithm": "sac", **training})
         self.network = ActorCritic(POLICY, SPACES, training=spec)
         self.network.policy_head.weight.data.normal_(std=0.3)
         computer = GradientComputer(spec, self.network, SPACES)
         assert isinstance(computer.algorithm, Sac)
-        self.sac, self.learned = computer.algorithm, computer.parameters
+        self.sac = computer.algorithm
         self.critics = TwinCritics(POLICY, SPACES, NO_MODULES)
-        self.sac.build(self.critics, self.network, self.learned, target_rate=spec.target_rate, is_mixed=False)
+        self.sac.build(self.critics, self.network, target_rate=spec.target_rate, is_mixed=is_mixed)
         self.sac.statistics["target_critics"].add_(torch.randn_like(self.sac.statistics["target_critics"]) * 0.1)
         self.sac.learned["log_temperature"].fill_(math.log(0.3))
 
@@ -78,7 +78,8 @@ def value(critics: TwinCritics, which: int, observation: Tensor, action: Tensor)
     for index, (weight, bias) in enumerate(layers):
         inputs = inputs @ weight[which] + bias[which, 0]
         if index < len(layers) - 1:
-            inputs = inputs.clamp(min=0.0)
+            inputs = inputs - inputs.mean()
+            inputs = (inputs / (inputs.square().mean() + 1e-5).sqrt()).clamp(min=0.0)
     return inputs[0]
 
 
@@ -163,6 +164,24 @@ def test_recorded_updates_have_the_gradients_of_the_others() -> None:
         torch.testing.assert_close(gradient, expected[name])
 
 
+def test_bfloat16_rounds_the_parameters_of_the_moment() -> None:
+    exact, rounded = Built(), Built(is_mixed=True)
+    for built in (exact, rounded):  # after the copies were made
+        torch.manual_seed(11)
+        for values in (built.sac.statistics["critics"], built.sac.statistics["target_critics"]):
+            values.add_(torch.randn_like(values))
+        for parameter in built.network.encoder.parameters():
+            parameter.data.add_(torch.randn_like(parameter))
+    for _ in range(EARLIER_CALLS + 2):
+        found = []
+        for built in (exact, rounded):
+            torch.manual_seed(5)
+            found.append(built.sac.gradients(transitions())[0])
+        for name, expected in found[0].items():
+            assert found[1][name].dtype == torch.float32
+            assert 0.0 < float((found[1][name] - expected).norm() / expected.norm()) < 0.05, name
+
+
 def test_target_critics_follow_the_critics() -> None:
     built = Built(target_rate=0.25)
     before, critics = built.sac.statistics["target_critics"].clone(), built.sac.statistics["critics"]
@@ -208,7 +227,7 @@ def test_convolutions_are_those_of_the_critics() -> None:
     computer, critics = GradientComputer(spec, network, spaces), TwinCritics(POLICY, spaces, NO_MODULES)
     sac = computer.algorithm
     assert isinstance(sac, Sac)
-    sac.build(critics, network, computer.parameters, target_rate=0.1, is_mixed=False)
+    sac.build(critics, network, target_rate=0.1, is_mixed=False)
     ours, theirs = (image_encoders(each.encoder)["pixels"].convolutions for each in (network, critics))
 
     def same() -> bool:
