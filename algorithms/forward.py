@@ -77,6 +77,11 @@ class Forward:
         with self._precision(starts):
             return self._network.unroll(observations, state, starts)
 
+    def policy(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the policies alone; return their parameters [R, B, P] and the state after the last row [B, S]."""
+        with self._precision(starts):
+            return self._network.policy(observations, state, starts)
+
     def target(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the same with the target network, without gradients.
 

@@ -41,12 +41,6 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
     """
     if not spec.algorithm.demonstrations:
         raise SettingsError(f"{spec.training.algorithm} does not learn from demonstrations: choose appo or sac")
-    if not spec.algorithm.replay and spec.policy.memory != "none":
-        raise SettingsError(
-            f"{spec.training.algorithm} imitates demonstrations step by step, and policy.memory is "
-            f"{spec.policy.memory}: set policy.memory=none, and environment.frame_stack if one observation does not "
-            "tell enough"
-        )
     if spec.environment.is_game:
         raise SettingsError("demonstrations are of one agent, and this environment has several")
     try:

@@ -1,6 +1,6 @@
 """The actor-critic network, built from its specification. Needs torch: actors do not import this file."""
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -97,18 +97,26 @@ class ActorCritic(nn.Module):
         Returns: parameters of the action distributions [R, B, P] and values [R, B], float32 also under autocast. The
         values are 0 without a value head.
         """
-        flat = {name: values.flatten(0, 1) for name, values in prepared.items()}
-        features = self.encoder(flat).unflatten(0, starts.shape)  # [R, B, F]
-        remembered = critic = self.memory.unroll(features, state, starts)
+        flat = _flattened(prepared)
+        remembered, _ = self._remembered(flat, state, starts)
+        critic = remembered
         if self.value_encoder is not None:
             critic = self.value_encoder(flat).unflatten(0, starts.shape)
-        # Both heads in full precision: bfloat16 would round values and logits to 8 bits, which is much of a TD error.
-        device = remembered.device.type
-        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
+        with _full_precision(remembered):
             parameters = self.policy_head(remembered.float())
             if self.value_head is None:
                 return parameters, parameters.new_zeros(parameters.shape[:-1])
             return parameters, self.value_head(critic.float()).squeeze(-1)
+
+    def policy(self, prepared: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the policies alone: as `unroll`, but with the state after the last row [B, S] in place of values."""
+        remembered, state = self._remembered(_flattened(prepared), state, starts)
+        with _full_precision(remembered):
+            return self.policy_head(remembered.float()), state
+
+    def _remembered(self, flat: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inputs of the policy head [R, B, F'] and the state after the last row, from [R x B, ...]."""
+        return self.memory.unroll(self.encoder(flat).unflatten(0, starts.shape), state, starts)
 
     def step(self, observations: Components, state: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the policies of one row: state [N, S] -> distribution parameters [N, P], next state [N, S]."""
@@ -143,3 +151,13 @@ class ActorCritic(nn.Module):
             return *explored, state
         actions = self.distribution.sample(parameters, uniform, normal, masks)
         return actions, self.distribution.log_prob(parameters, actions, masks), state
+
+
+def _flattened(prepared: Components) -> Components:
+    return {name: values.flatten(0, 1) for name, values in prepared.items()}
+
+
+def _full_precision(features: Tensor) -> AbstractContextManager[object]:
+    """Return the context of the heads: bfloat16 would round values and logits to 8 bits, much of a TD error."""
+    device = features.device.type
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()

@@ -16,7 +16,7 @@ class Memory(Protocol):
         """Process one row: features [N, F], state [N, S] -> [N, F'], next state [N, S]."""
         ...
 
-    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
+    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         """Process R consecutive rows.
 
         Args:
@@ -24,7 +24,7 @@ class Memory(Protocol):
           state: [B, S] float32, before row 0.
           starts: [R, B] bool, whether an episode starts with the row; the state is then reset to zeros.
 
-        Returns: [R, B, F'].
+        Returns: [R, B, F'], and the state after the last row [B, S].
         """
         ...
 
@@ -41,9 +41,9 @@ class NoMemory(nn.Module):
         """See Memory."""
         return features, state
 
-    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
+    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         """See Memory."""
-        return features
+        return features, state
 
 
 class Gru(nn.Module):
@@ -74,13 +74,13 @@ class Gru(nn.Module):
         state = self._next(self.input(features), state)
         return state, state
 
-    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
+    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         """See Memory."""
         states = []
         for inputs, start in zip(self.input(features), starts.unsqueeze(-1), strict=True):
             state = self._next(inputs, state.masked_fill(start, 0.0))
             states.append(state)
-        return torch.stack(states)
+        return torch.stack(states), state
 
     def _next(self, inputs: Tensor, state: Tensor) -> Tensor:
         """Return the next state: projected inputs [N, 3S], state [N, S] -> [N, S]."""

@@ -1,5 +1,6 @@
 """Behaviour cloning with appo: before training, and as a term of the loss that fades."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,8 +8,11 @@ import pytest
 import torch
 from building import identity, make_rollout
 
+from daedalus.algorithms.forward import FlatParameters, Forward
 from daedalus.algorithms.replay_buffer import ReplayBuffer
+from daedalus.learner.training.demonstrations import Cloning
 from daedalus.learner.training.learner import Learner
+from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout
@@ -77,3 +81,74 @@ def test_the_term_of_the_loss_fades(progress: float, changes: bool) -> None:
         learner.step([shown(9)], progress)
         weights.append(np.concatenate([values.ravel() for values in learner.weights().values()]))
     assert (weights[0] != weights[1]).any() == changes
+
+
+MEMORY = PolicySpec(hidden=(8,), memory="gru", memory_units=8)
+CUE = Spaces(
+    observations={"observation": ArraySpace(shape=(2,), dtype="float32")},
+    actions={"action": DiscreteSpace(counts=(2,))},
+)
+
+
+def cues(lengths: list[int]) -> ReplayBuffer:
+    """Return episodes that show at their first step only what all their actions are."""
+    total = sum(lengths) + len(lengths)  # with the row between two episodes
+    columns = -(-total // ROWS)
+    frames = np.random.default_rng(1).normal(0.0, 0.3, (columns * ROWS + 1, 2)).astype(np.float32)
+    actions, valid = np.zeros(columns * ROWS, np.uint8), np.zeros(columns * ROWS, np.bool_)
+    first = 0
+    for number, length in enumerate(lengths):
+        frames[first, 0] = cue = 3.0 if number % 2 else -3.0
+        actions[first : first + length], valid[first : first + length] = cue > 0.0, True
+        first += length + 1
+    buffer = ReplayBuffer(CUE, ROWS, columns * ROWS)
+    rollout = make_rollout(identity(), rows=ROWS, environments=columns)
+    buffer.add(
+        replace(
+            rollout,
+            frames={"observation": np.stack([frames[ROWS * each :][: ROWS + 1] for each in range(columns)], 1)},
+            actions={"action": actions.reshape(columns, ROWS).T[..., None]},
+            initial_state=np.zeros((columns, 0), np.float32),
+            terminated=np.zeros((ROWS, columns), np.bool_),
+            truncated=np.zeros((ROWS, columns), np.bool_),
+            valid=valid.reshape(columns, ROWS).T,
+        )
+    )
+    return buffer
+
+
+def test_a_policy_with_memory_imitates_what_was_shown_long_before() -> None:
+    spec = TrainingSpec.model_validate({"algorithm": "appo", "learning_rate": 0.03, "cloning_updates": 40})
+    learner = Learner(spec, MEMORY, CUE)
+    learner.learn_from(cues([70] * 12))
+    words = learner.clone().split()
+    assert float(words[-4]) == pytest.approx(-np.log(2.0), abs=0.05)
+    assert float(words[-2]) > -0.1  # of the last episode, which shows one cue
+
+
+def test_the_state_is_carried_through_an_episode_from_its_beginning() -> None:
+    torch.manual_seed(0)
+    network, buffer = ActorCritic(MEMORY, CUE), cues([150])
+    with torch.no_grad():
+        network.policy_head.weight.normal_()
+    learned = FlatParameters(network.learned_parameters())
+    cloning = Cloning(network, learned, Forward(network, learned, has_target=False, is_mixed=False), CUE, buffer)
+    shown = buffer.transitions(np.arange(150), 1, 1.0)
+    states, log_probs = [torch.zeros((1, 8))], []
+    for step in range(150):  # one row after the other
+        # As the gradient does not go beyond the 64 rows of a minibatch, or beyond a new beginning:
+        state = states[-1].detach() if step in (64, 128) else states[-1]
+        observed = {name: values[step : step + 1] for name, values in shown.observations.items()}
+        parameters, state = network.step(observed, state)
+        states.append(state)
+        actions = {"action": shown.actions[step : step + 1].long()}
+        log_probs.append(network.distribution.log_prob(parameters, actions, {}))
+    first, second = (torch.cat(log_probs[part]) for part in (slice(0, 64), slice(64, 128)))
+    third = torch.cat([*log_probs[128:135], *log_probs[:57]])  # 15 of 150 are held out
+    for expected in (first, second, third):
+        found = cloning.gradient()
+        wanted = torch.autograd.grad(
+            -expected.mean(), network.learned_parameters(), materialize_grads=True, retain_graph=True
+        )
+        torch.testing.assert_close(found, torch.cat([each.flatten() for each in wanted]), atol=1e-6, rtol=1e-4)
+    assert cloning.held_out() == pytest.approx(float(torch.cat(log_probs[135:]).detach().mean()), rel=1e-4)
