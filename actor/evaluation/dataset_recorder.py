@@ -1,7 +1,9 @@
 """Records the episodes of an environment into a dataset, whoever plays: a policy, a bot, a person at the keyboard."""
 
 import copy
+import os
 import warnings
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import gymnasium
@@ -13,9 +15,12 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.minari_files import Episode, MinariWriter
+from daedalus.actor.evaluation.gamepad import INSTALL_PYGAME
 from daedalus.actor.evaluation.loaded_policy import Policy
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
+
+_RATE = 30  # steps a second, where the environment does not say
 
 
 class _EnoughError(Exception):
@@ -76,6 +81,7 @@ class Recorder(gymnasium.Wrapper):
         self._observations: list[Any] = []
         self._actions: list[Any] = []
         self._rewards: list[float] = []
+        self._act: Callable[[], Any] | None = None  # chooses the actions in place of whoever steps
         self.returns: list[float] = []  # of the recorded episodes
 
     @property
@@ -94,6 +100,8 @@ class Recorder(gymnasium.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and write the episode if it ends. Raises DatasetError."""
         # Environments and players may use the same arrays again.
+        if self._act is not None:
+            action = self._act()
         self._actions.append(copy.deepcopy(action))
         result = observation, reward, terminated, truncated, _ = self.env.step(action)
         self._observations.append(copy.deepcopy(observation))
@@ -121,13 +129,16 @@ class Recorder(gymnasium.Wrapper):
                 observation, _, terminated, truncated, info = self.step(action)
                 over = terminated or truncated
 
-    def play_by_keys(self, keys: dict[str, Any] | None, idle: Any, rate: int | None) -> None:
+    def play_in_window(
+        self, keys: dict[str, Any] | None, idle: Any, rate: int | None, act: Callable[[], Any] | None = None
+    ) -> None:
         """Let a person play in a window, until all episodes are recorded or it is closed.
 
         Args:
           keys: an action for each key, or for several that are pressed together; None: those of the environment.
           idle: the action while no key is pressed.
           rate: steps a second; None: the environment's own.
+          act: chooses the actions in place of keys, such as `Gamepad.action`.
 
         Raises EnvironmentSetupError if there is no window or there are no keys, and DatasetError.
         """
@@ -136,42 +147,91 @@ class Recorder(gymnasium.Wrapper):
                 warnings.simplefilter("ignore")  # its plots, which are not used, lack a window or matplotlib
                 from gymnasium.utils.play import MissingKeysToAction, play
         except (ImportError, gymnasium.error.DependencyNotInstalled):
-            raise EnvironmentSetupError("the keyboard needs a window: pip install pygame-ce") from None
+            raise EnvironmentSetupError(f"a window needs pygame: {INSTALL_PYGAME}") from None
         import pygame
 
-        actions = None if keys is None else {"".join(key): self._of_space(value) for key, value in keys.items()}
+        space, self._act = self.action_space, act
+        actions = {} if act is not None else keys
+        if actions is not None:
+            actions = {"".join(key): action_of(space, value) for key, value in actions.items()}
         try:
-            play(self, keys_to_action=actions, noop=self._of_space(idle), fps=rate)  # pyright: ignore[reportArgumentType]
+            self._check_picture()
+            play(
+                self,
+                keys_to_action=actions,  # pyright: ignore[reportArgumentType]
+                noop=action_of(space, idle),
+                fps=rate or round(self.metadata.get("render_fps") or _RATE),
+            )
         except _EnoughError:
             pass
-        except (MissingKeysToAction, pygame.error, ValueError, TypeError) as error:
+        except MissingKeysToAction as error:
             raise EnvironmentSetupError(f"the keyboard cannot play: {error}: name keys with --key K=ACTION") from None
+        except (pygame.error, ValueError, TypeError) as error:
+            raise EnvironmentSetupError(f"nobody can play in a window: {error}") from None
         finally:
             pygame.quit()
 
-    def _of_space(self, action: Any) -> Any:
-        """Return an action as the space has it. Raises EnvironmentSetupError if it is none."""
-        space = self.action_space
-        given = np.zeros(space.shape or ()).tolist() if action is None else action
-        try:
-            action = np.asarray(given, space.dtype)
-            fits = action.dtype.kind == "f" or bool((action == np.asarray(given)).all())  # 0.5 is no choice
-        except (ValueError, TypeError, OverflowError):
-            fits = False
-        else:
-            action = action[()] if space.shape == () else action
-        if not (fits and space.contains(action)):
-            raise EnvironmentSetupError(f"the action {given} of a key, or without one, is outside {space}")
-        return action
+    def _check_picture(self) -> None:
+        self.reset()
+        picture = self.render()
+        if not isinstance(picture, np.ndarray):
+            raise EnvironmentSetupError(
+                "the environment shows a person no picture: its render() must return an array with "
+                f"render_mode='rgb_array', and returns {type(picture).__name__}"
+            )
 
 
-def recorded_environment(spec: EnvironmentSpec, modules: UserModules, render_mode: str | None) -> gymnasium.Env:
-    """Return one environment as evaluations play it, whose actions nobody repeats. Raises EnvironmentSetupError."""
+def action_of(space: gymnasium.Space, given: Any) -> Any:
+    """Return an action that was written as JSON as the space has it; None: zeros.
+
+    Raises EnvironmentSetupError if it is none.
+    """
+    written = np.zeros(space.shape or ()).tolist() if given is None else given
+    try:
+        action = np.asarray(written, space.dtype)
+        fits = action.dtype.kind == "f" or bool((action == np.asarray(written)).all())  # 0.5 is no choice
+        action = action[()] if space.shape == () else action
+        if fits and space.contains(action):
+            return action
+    except (ValueError, TypeError, OverflowError):
+        pass
+    raise EnvironmentSetupError(f"the action {written} of a key, or without one, is outside {space}")
+
+
+def recorded_environment(spec: EnvironmentSpec, modules: UserModules, *, for_person: bool) -> gymnasium.Env:
+    """Return one environment as evaluations play it, whose actions nobody repeats.
+
+    `for_person`: whether Recorder.play_in_window will play it. Raises EnvironmentSetupError.
+    """
     if spec.is_game:
         raise EnvironmentSetupError("datasets are of one agent, and this environment has several")
+    if for_person:
+        _open_display()
     plain = as_on_gymnasium(spec.as_evaluated()).model_copy(update={"action_repeat": 1, "processes": False})
     with creation_errors(spec.id):
-        return EnvironmentFactory(spec=plain, modules=modules, render_mode=render_mode)()
+        return EnvironmentFactory(spec=plain, modules=modules, render_mode="rgb_array" if for_person else None)()
+
+
+def _open_display() -> None:
+    """Open the display of SDL before an environment is made that renders pictures, which needs none.
+
+    Raises EnvironmentSetupError if there is no display, or pygame is not installed.
+    """
+    try:
+        import pygame
+    except ImportError:
+        raise EnvironmentSetupError(f"a window needs pygame: {INSTALL_PYGAME}") from None
+    try:
+        pygame.display.init()
+        driver = pygame.display.get_driver()
+    except pygame.error as error:
+        driver = str(error)
+    else:
+        if driver != "offscreen" or os.environ.get("SDL_VIDEODRIVER"):
+            return
+    raise EnvironmentSetupError(
+        f"there is no display for the window ({driver}): play on a machine with a screen, or over `ssh -X`"
+    )
 
 
 def spec_to_record(environment: gymnasium.Env) -> Any:

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -18,18 +19,27 @@ from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, modules_of
 from daedalus.protocol.spec import EnvironmentSpec
 
-_KEYS = "keys"
+_KEYS, _GAMEPAD = "keys", "gamepad"
 
 _DESCRIPTION = """\
 Plays episodes and records them into a Minari dataset, with the id of the environment: the policy of a run, a bot of
-your own, random actions, or you at the keyboard. `daedalus train` learns from it with --demonstrations. An episode is
-recorded when it ends; after Ctrl-C, or when the window is closed, the dataset has those that ended before."""
+your own, random actions, or you, with the keyboard or a gamepad. `daedalus train` learns from it with
+--demonstrations. An episode is recorded when it ends; after Ctrl-C, or when the window is closed, the dataset has those
+that ended before.
+
+With --by gamepad, an axis moves a number of the action: at rest the number is that of --idle, to the right, down, or
+pressed it goes up to its highest, to the left or up it goes down to its lowest. Axes: leftx, lefty, rightx, righty,
+lefttrigger, righttrigger. Buttons: a, b, x, y, back, guide, start, leftstick, rightstick, leftshoulder, rightshoulder,
+dpup, dpdown, dpleft, dpright; a direction of a stick is one, too, such as leftx- for left. The program prints what each
+does, and the name of a button when you first press it."""
 
 _EXAMPLES = """\
 examples:
   daedalus record runs/pendulum-sac-s1-20261121-101500 --out pendulum/mine-v0
   daedalus record --env MountainCarContinuous-v0 --by my_module:Pump --out ./car
   daedalus record --env CarRacing-v3 --by keys --key a=[-1,0.2,0] --key d=[1,0.2,0] --key w=[0,1,0] --out ./laps
+  daedalus record --env CarRacing-v3 --by gamepad --axis leftx=0 --axis righttrigger=1 --axis lefttrigger=2 --out ./laps
+  daedalus record --env LunarLander-v3 --by gamepad --key a=2 --key leftx-=1 --key leftx+=3 --out ./landings
 
 exit status: 0 all episodes are recorded, 1 failed or stopped, 2 bad usage"""
 
@@ -48,7 +58,8 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--by",
         metavar="PLAYER",
-        help="who plays it: module:Bot, a class with act(observation, action_mask), or `random`, or `keys` for you",
+        help="who plays it: module:Bot, a class with act(observation, action_mask), or `random`; `keys` or `gamepad` "
+        "for you",
     )
     options.add_argument(
         "--out",
@@ -69,11 +80,24 @@ def parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="K=ACTION",
-        help="with --by keys: the action, as JSON, while a key is pressed, or several together, as in wa=[-1,1,0]. May "
-        "be given several times (default: the keys that the environment names)",
+        help="with --by keys: the action, as JSON, while a key is pressed, or several together, as in wa=[-1,1,0]; "
+        "with --by gamepad: a button, or several together, as in dpup,a=4. May be given several times (default: the "
+        "keys that the environment names, and no button)",
     )
-    options.add_argument("--idle", metavar="ACTION", help="with --by keys: the action without a key (default: zeros)")
-    options.add_argument("--rate", type=whole_number, metavar="N", help="with --by keys: steps a second")
+    options.add_argument(
+        "--axis",
+        action="append",
+        default=[],
+        metavar="AXIS=N",
+        help="with --by gamepad: the axis moves number N of a Box, from 0; -N: the other way round. May be given "
+        "several times (default, without --key: triggers for numbers whose lowest is 0, sticks for others)",
+    )
+    options.add_argument(
+        "--idle",
+        metavar="ACTION",
+        help="with --by keys or gamepad: the action without a key (default: zeros)",
+    )
+    options.add_argument("--rate", type=whole_number, metavar="N", help="with --by keys or gamepad: steps a second")
     add_allow_module(options, "the run")
     add_logging(options)
     return options
@@ -89,7 +113,7 @@ def record(arguments: list[str]) -> int:
         write=lambda line: say(line, sys.stderr),
     )
     try:
-        keys, idle = _actions(parsed)
+        keys, idle, axes = *_actions(parsed), _axes(parsed.axis)
     except ValueError as error:
         print_error("record", error)
         return 2
@@ -100,7 +124,7 @@ def record(arguments: list[str]) -> int:
 
     try:
         with redirect_stdout(sys.stderr):  # the environment may print
-            return _record(parsed, keys, idle)
+            return _record(parsed, keys, idle, axes)
     except (DamagedError, DatasetError, EnvironmentSetupError, NoPolicyError, PolicyError) as error:
         if isinstance(reason := error.__cause__, ModuleNotAllowedError):
             print_error("record", allowing(reason, ["daedalus", "record", *arguments]))
@@ -120,6 +144,18 @@ def _actions(parsed: argparse.Namespace) -> tuple[dict[str, Any] | None, Any]:
     return keys or None, None if parsed.idle is None else _json(parsed.idle, f"--idle {parsed.idle}")
 
 
+def _axes(words: Sequence[str]) -> list[tuple[str, int, bool]]:
+    """Return the axes as Gamepad has them. Raises ValueError."""
+    axes = []
+    for each in words:
+        axis, _, number = each.partition("=")
+        digits = number.removeprefix("-")
+        if not (axis and digits.isdecimal()):
+            raise ValueError(f"--axis {each}: write AXIS=N, such as leftx=0")
+        axes.append((axis, int(digits), number.startswith("-")))
+    return axes
+
+
 def _json(text: str, where: str) -> Any:
     try:
         return json.loads(text)
@@ -127,31 +163,40 @@ def _json(text: str, where: str) -> Any:
         raise ValueError(f"{where}: the action is no JSON: write a number or a list of numbers") from None
 
 
-def _record(parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any) -> int:
+def _record(
+    parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any, axes: Sequence[tuple[str, int, bool]]
+) -> int:
     from daedalus.actor.environments.minari_files import MinariWriter
     from daedalus.actor.evaluation.dataset_recorder import (
         BotPlayer,
         PolicyPlayer,
         Recorder,
+        action_of,
         recorded_environment,
         spec_to_record,
     )
+    from daedalus.actor.evaluation.gamepad import Gamepad
     from daedalus.actor.evaluation.loaded_policy import load_policy
 
-    by_keys, player = parsed.by == _KEYS, None
+    by_person, player = parsed.by in (_KEYS, _GAMEPAD), None
     if parsed.directory is not None:
         policy = load_policy(parsed.directory, newest=parsed.newest, allow_modules=parsed.allow_module)
         spec, who = policy.spec.environment, f"the policy of {parsed.directory}, version {policy.policy_version}"
         modules = UserModules(frozenset(parsed.allow_module), str(parsed.directory))
         player = PolicyPlayer(policy, sampled=parsed.sampled)
     else:
-        spec, who = EnvironmentSpec(id=parsed.env), "a person" if by_keys else parsed.by
+        spec, who = EnvironmentSpec(id=parsed.env), "a person" if by_person else parsed.by
         # The command line itself names them.
         named = modules_of({word: word for word in (parsed.env, parsed.by) if ":" in word})
         modules = UserModules(frozenset({*named, *parsed.allow_module}), "the command line")
-    environment = recorded_environment(spec, modules, "rgb_array" if by_keys else None)
+    environment = recorded_environment(spec, modules, for_person=by_person)
     try:
-        if player is None and not by_keys:
+        gamepad = None
+        if parsed.by == _GAMEPAD:
+            space = environment.action_space
+            pressed = {frozenset(names.split(",")): action_of(space, action) for names, action in (keys or {}).items()}
+            gamepad = Gamepad(space, action_of(space, idle), pressed, axes).action
+        if player is None and not by_person:
             player = BotPlayer(parsed.by, environment.action_space, modules)
         spaces = environment.observation_space, environment.action_space
         writer = MinariWriter(parsed.out, *spaces, spec_to_record(environment), algorithm=who)
@@ -159,7 +204,7 @@ def _record(parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any) 
         stopped = False
         try:
             if player is None:
-                recorder.play_by_keys(keys, idle, parsed.rate)
+                recorder.play_in_window(keys, idle, parsed.rate, gamepad)
             else:
                 recorder.play(player)
         except KeyboardInterrupt:

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import minari
 import numpy as np
+import pygame
 import pytest
 
 from daedalus.actor.environments.minari_files import MinariWriter
@@ -15,6 +16,7 @@ from daedalus.cli.commands.record import record
 
 PUMP = """
 import numpy as np
+from gymnasium.envs.classic_control import CartPoleEnv
 
 class Pump:
     def reset(self, agent, seed):
@@ -23,6 +25,10 @@ class Pump:
     def act(self, observation, action_mask):
         self.steps += 1
         return np.array([1.0 if observation[1] >= 0 else -1.0], np.float32) * (0.5 if self.steps % 2 else 1.0)
+
+class Unseen(CartPoleEnv):
+    def render(self):
+        return None
 """
 
 
@@ -100,6 +106,9 @@ def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) 
         (("--env", "CartPole-v1", "--by", "keys", "--key", 'a=["x"]'), 1, "the action ['x'] of a key"),
         (("--env", "CartPole-v1", "--by", "keys", "--key", "a"), 2, "write K=ACTION"),
         (("--env", "CartPole-v1", "--by", "keys"), 1, "name keys with --key"),
+        (("--env", "CartPole-v1", "--by", "gamepad", "--key", "a=1"), 1, "no gamepad is connected"),
+        (("--env", "CartPole-v1", "--by", "gamepad", "--axis", "leftx"), 2, "write AXIS=N"),
+        (("--env", "pumping:Unseen", "--by", "keys", "--key", "a=1"), 1, "render() must return an array"),
         (("--env", "CartPole-v1", "--by", "pumping:Nobody"), 1, "Nobody"),
         (("--env", "pettingzoo.classic.connect_four_v3", "--by", "random"), 1, "datasets are of one agent"),
     ],
@@ -116,3 +125,14 @@ def test_what_cannot_be_recorded_leaves_nothing(
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
     assert reason in line
     assert not (tmp_path / "shown").exists()
+
+
+def test_a_person_without_a_display_is_told_so(
+    recorded: Callable[..., int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """SDL would open a window that nobody sees, and record an episode of nobody's actions."""
+    pygame.quit()
+    for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert recorded("--env", "CartPole-v1", "--by", "keys", "--key", "a=1", "--episodes", 1) == 1
+    assert "there is no display for the window" in capsys.readouterr().err
