@@ -46,7 +46,7 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
     try:
         with MinariReader(name, spec.environment.leave_out) as dataset:
             transforms = Transforms(spec.environment, dataset.observation_space, dataset.action_space)
-            if spaces is not None and transforms.spaces != spaces:
+            if spaces is not None and transforms.spaces.without_masks() != spaces.without_masks():
                 raise SettingsError(
                     f"dataset {name} has other spaces than the run: {transforms.spaces} in the dataset, and "
                     f"{spaces} in the run"
@@ -73,9 +73,15 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
 
 
 def _warn(dataset: MinariReader, environment: EnvironmentSpec) -> None:
-    if dataset.environment and dataset.environment != environment.id:
+    if dataset.environment and dataset.environment != environment.id.rpartition(":")[2]:
         _logger.warning(
             "dataset %s was recorded in %s, and the run plays %s", dataset.name, dataset.environment, environment.id
+        )
+    if dataset.has_images_as_jpeg:
+        _logger.warning(
+            "dataset %s has images as JPEG, which are not quite those that the policy will see: Minari writes exact "
+            "ones with jpeg_encoding=False",
+            dataset.name,
         )
     if environment.action_repeat > 1:
         _logger.warning(

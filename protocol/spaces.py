@@ -263,6 +263,14 @@ class Spaces(Specification):
             if isinstance(space, DiscreteSpace) and space.masked
         }
 
+    def without_masks(self) -> "Spaces":
+        """Return the same spaces whose choices are all legal."""
+        actions = {
+            name: space.model_copy(update={"masked": False}) if isinstance(space, DiscreteSpace) else space
+            for name, space in self.actions.items()
+        }
+        return self.model_copy(update={"actions": actions})
+
     def replay_bytes(self, rows: int) -> int:
         """Return the memory of some rows of one environment in a replay buffer (algorithms/replay_buffer.py)."""
         frames = sum(

@@ -5,6 +5,7 @@ the author of a dataset has chosen. This reader imports nothing, and reads array
 checked before memory is allocated for them. h5py and minari are the extra `demonstrations`.
 """
 
+import io
 import json
 import math
 import shutil
@@ -132,6 +133,11 @@ class MinariReader:
         """Number of steps of all episodes."""
         return sum(self._lengths)
 
+    @property
+    def has_images_as_jpeg(self) -> bool:
+        """Whether images of the observations lost detail when they were written."""
+        return any(self._is_jpeg(leaf.space) for leaf in leaves(self.observation_space, "observation"))
+
     def __iter__(self) -> Iterator[Episode]:
         """Yield the episodes in their order. Raises DatasetError."""
         for number in range(len(self._lengths)):
@@ -160,8 +166,32 @@ class MinariReader:
             found = group
             for key in () if isinstance(leaf.space, LeftOut) else leaf.path:
                 found = found[_key(key)]
-            parts[leaf.path] = None if isinstance(leaf.space, LeftOut) else found[()]
+            if isinstance(leaf.space, LeftOut):
+                parts[leaf.path] = None
+            elif self._is_jpeg(leaf.space):
+                parts[leaf.path] = np.stack([self._decoded(found, number, leaf.space) for number in range(len(found))])
+            else:
+                parts[leaf.path] = found[()]
         return nested(space, (), parts)
+
+    def _is_jpeg(self, space: gymnasium.Space) -> bool:
+        from minari.dataset.minari_storage import is_image_space
+
+        return self._has_jpegs and not isinstance(space, LeftOut) and is_image_space(space)
+
+    def _decoded(self, files: "h5py.Dataset", number: int, space: gymnasium.Space) -> np.ndarray:
+        """Return an image of the space's shape. Raises DatasetError, before it is decoded, for any other."""
+        from PIL import Image
+
+        try:
+            with Image.open(io.BytesIO(files[number].tobytes()), formats=["JPEG"]) as image:
+                shape = (image.height, image.width, *((len(image.getbands()),) if len(space.shape or ()) > 2 else ()))
+                if shape == space.shape and image.mode in ("L", "RGB"):
+                    return np.asarray(image, np.uint8).reshape(shape)
+                reason = f"it is {image.mode} {image.width} x {image.height}, not of shape {space.shape}"
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            reason = str(error)
+        raise self._error(f"image {number} of {files.name} cannot be read: {reason}")
 
     # -------------------------------------------------------------------------------------------- checks
 
@@ -188,7 +218,10 @@ class MinariReader:
                 for key in (name, *map(_key, leaf.path[:-1])) if leaf.path else ():
                     found = self._member(found, key, is_group=True)
                 found = self._member(found, _key(leaf.path[-1]) if leaf.path else name)
-                self._check_array(found, (rows, *(leaf.space.shape or ())), leaf.space)
+                if self._is_jpeg(leaf.space):
+                    self._check_jpegs(found, rows, leaf.space)
+                else:
+                    self._check_array(found, (rows, *(leaf.space.shape or ())))
         return steps
 
     def _member(self, group: Any, name: str, *, is_group: bool = False) -> Any:
@@ -203,11 +236,18 @@ class MinariReader:
             raise self._error(f"{found.name} is no {'group' if is_group else 'array'}")
         return found
 
-    def _check_array(self, array: "h5py.Dataset", shape: tuple[int, ...], space: gymnasium.Space | None = None) -> None:
-        if self._has_jpegs and space is not None and _is_jpeg(space):
-            raise self._error(
-                f"{array.name} has its images as JPEG, which are not read: write the dataset with jpeg_encoding=False"
-            )
+    def _check_jpegs(self, array: "h5py.Dataset", rows: int, space: gymnasium.Space) -> None:
+        """Check an array of files, in bytes: [rows, n], or [rows] of as many bytes as each has."""
+        import h5py
+
+        if h5py.check_vlen_dtype(array.dtype) != np.uint8:
+            self._check_array(array, (rows, *array.shape[1:2]))
+        elif array.is_virtual or array.external or array.shape != (rows,):
+            raise self._error(f"{array.name} has the shape {array.shape}, not {(rows,)}, or is in another file")
+        if (size := rows * math.prod(space.shape or ())) > _EPISODE_BYTES:
+            raise self._error(f"{array.name} has {size:,} bytes of pixels: an episode may have {_EPISODE_BYTES:,}")
+
+    def _check_array(self, array: "h5py.Dataset", shape: tuple[int, ...]) -> None:
         if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
             raise self._error(f"{array.name} holds {array.dtype}, and only numbers are read")
         if array.is_virtual or array.external:
@@ -270,12 +310,6 @@ class MinariReader:
 
 def _key(key: str | int) -> str:
     return f"_index_{key}" if isinstance(key, int) else key
-
-
-def _is_jpeg(space: gymnasium.Space) -> bool:
-    from minari.dataset.minari_storage import is_image_space
-
-    return is_image_space(space)
 
 
 def _check_space(described: Any) -> None:

@@ -150,6 +150,7 @@ class DemonstrationFiles:
                 content.steps,
             ):
                 raise DamagedError(f"{path}: the rollout is not that of its manifest")
-            if violation := first_component_violation(rollout, spaces, policy) or number_violation(rollout):
+            violation = first_component_violation(rollout, spaces.without_masks(), policy) or number_violation(rollout)
+            if violation:
                 raise SettingsError(f"the demonstrations of {content.dataset} do not fit the run: {violation}")
             yield rollout

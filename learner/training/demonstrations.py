@@ -145,7 +145,8 @@ class Cloning:
             name: part.long() if isinstance(space, DiscreteSpace) else part
             for (name, space), part in zip(self._spaces.actions.items(), parts, strict=True)
         }
-        return self._network.distribution.log_prob(parameters, actions, {}), state
+        legal = {name: starts.new_ones((*rows.shape, choices)) for name, choices in self._spaces.masks.items()}
+        return self._network.distribution.log_prob(parameters, actions, legal), state
 
 
 class _Sequences:

@@ -1,5 +1,6 @@
 """Minari datasets as demonstrations: every transition against the recorded episodes, and hostile datasets."""
 
+import io
 import json
 import logging
 import pickle
@@ -15,6 +16,8 @@ import minari
 import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+from PIL import Image
 
 from daedalus.actor.environments.minari_files import DatasetError, Episode, MinariReader, MinariWriter
 from daedalus.actor.environments.transforms import Transforms
@@ -23,6 +26,7 @@ from daedalus.launch.dataset_import import write_demonstrations
 from daedalus.learner.run import demonstration_files
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.demonstrations import read_demonstrations
+from daedalus.learner.training.learner import Learner
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
@@ -312,3 +316,84 @@ def test_recorded_actions_are_what_the_policy_would_have_chosen(
         np.testing.assert_allclose(found[name], values, atol=1e-6)
     with pytest.raises(ValueError, match="action"):
         transforms.policy_action(outside)
+
+
+def seen(folder: Path, images: np.ndarray) -> Path:
+    """Write a dataset of one episode as Minari does by default, with images as JPEG."""
+    space = gymnasium.spaces.Dict(
+        {"camera": gymnasium.spaces.Box(0, 255, images.shape[1:], np.uint8), "arm": OBSERVATIONS}
+    )
+    steps = len(images) - 1
+    folder.mkdir()
+    storage = MinariStorage.new(folder / "data", space, gymnasium.spaces.Discrete(2))
+    episode = EpisodeBuffer(
+        observations={"camera": images, "arm": np.zeros((steps + 1, 2))},  # pyright: ignore[reportArgumentType]
+        actions=[0] * steps,
+        rewards=[0.0] * steps,
+        terminations=[False] * steps,
+        truncations=[False] * (steps - 1) + [True],
+    )
+    storage.update_episodes([episode])
+    storage.update_metadata({"dataset_id": "seen-v0", "minari_version": minari.__version__})
+    return folder
+
+
+@pytest.mark.parametrize(("shape", "plain"), [((32, 40, 3), False), ((32, 40, 3), True), ((33, 32), False)])
+def test_images_as_jpeg_are_those_that_minari_reads(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, shape: tuple[int, ...], plain: bool
+) -> None:
+    random = np.random.default_rng(1)
+    images = random.integers(0, 255, (4, *shape)).astype(np.uint8)
+    if plain:
+        images[:] = images[:, :1, :1]  # files of one length
+    folder = seen(tmp_path / "seen", images)
+    theirs = minari.MinariDataset(folder / "data")[0].observations["camera"]
+    with MinariReader(str(folder)) as dataset:
+        (episode,) = dataset
+    np.testing.assert_array_equal(episode.observations["camera"], theirs)
+    spec = RunSpec.model_validate({"environment": {"id": "A-v0"}, "training": {"algorithm": "appo"}})
+    with caplog.at_level(logging.WARNING):
+        write_demonstrations(str(folder), spec, None, tmp_path)
+    assert "images as JPEG, which are not quite those" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda image: image[:200], "[Tt]runcated"),
+        (lambda image: jpeg((64, 40)), "it is RGB 64 x 40, not of shape"),
+        (lambda image: jpeg((40, 32), "L"), "it is L 40 x 32, not of shape"),
+        (lambda image: jpeg((40, 32), form="png"), "cannot identify"),
+    ],
+)
+def test_a_hostile_image_is_refused(tmp_path: Path, change: Any, reason: str) -> None:
+    images = np.random.default_rng(1).integers(0, 255, (4, 32, 40, 3)).astype(np.uint8)
+    folder = seen(tmp_path / "seen", images)
+    with h5py.File(folder / "data/main_data.hdf5", "a") as file:
+        group: Any = file["episode_0/observations"]
+        group["camera"][2] = np.frombuffer(change(group["camera"][2].tobytes()), np.uint8)
+    with (
+        MinariReader(str(folder)) as dataset,
+        pytest.raises(DatasetError, match=f"image 2 .* cannot be read: .*{reason}"),
+    ):
+        list(dataset)
+
+
+def jpeg(size: tuple[int, int], mode: str = "RGB", form: str = "jpeg") -> bytes:
+    Image.new(mode, size).save(data := io.BytesIO(), form)
+    return data.getvalue()
+
+
+def test_choices_with_masks_are_learned_from_without_them(tmp_path: Path) -> None:
+    """A dataset has no masks of the environment's info: what was played was legal."""
+    space = gymnasium.spaces.Discrete(3)
+    writer = MinariWriter(str(tmp_path / "shown"), OBSERVATIONS, space)
+    writer.add(episode(0, 5, terminated=True)._replace(actions=np.array([0, 2, 1, 1, 0])))
+    masked = Spaces(observations=spaces_of().observations, actions={"action": DiscreteSpace(counts=(3,), masked=True)})
+    spec = RunSpec.model_validate({"environment": {"id": "Arm-v0"}, "training": {"algorithm": "appo"}})
+    write_demonstrations(str(tmp_path / "shown"), spec, masked, tmp_path)
+    buffer = read_demonstrations(tmp_path, spec, masked, 0)
+    assert buffer is not None
+    learner = Learner(spec.training.model_copy(update={"cloning_updates": 2}), spec.policy, masked)
+    learner.learn_from(buffer)
+    assert "mean log-probability" in learner.clone()
