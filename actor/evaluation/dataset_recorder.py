@@ -3,7 +3,6 @@
 import copy
 import os
 import warnings
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import gymnasium
@@ -15,7 +14,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.minari_files import Episode, MinariWriter
-from daedalus.actor.evaluation.gamepad import INSTALL_PYGAME
+from daedalus.actor.evaluation.gamepad import INSTALL_PYGAME, Gamepad
 from daedalus.actor.evaluation.loaded_policy import Policy
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
@@ -81,7 +80,7 @@ class Recorder(gymnasium.Wrapper):
         self._observations: list[Any] = []
         self._actions: list[Any] = []
         self._rewards: list[float] = []
-        self._act: Callable[[], Any] | None = None  # chooses the actions in place of whoever steps
+        self._gamepad: Gamepad | None = None  # chooses the actions in place of whoever steps
         self.returns: list[float] = []  # of the recorded episodes
 
     @property
@@ -100,8 +99,8 @@ class Recorder(gymnasium.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and write the episode if it ends. Raises DatasetError."""
         # Environments and players may use the same arrays again.
-        if self._act is not None:
-            action = self._act()
+        if self._gamepad is not None:
+            action = self._gamepad.action()
         self._actions.append(copy.deepcopy(action))
         result = observation, reward, terminated, truncated, _ = self.env.step(action)
         self._observations.append(copy.deepcopy(observation))
@@ -130,7 +129,7 @@ class Recorder(gymnasium.Wrapper):
                 over = terminated or truncated
 
     def play_in_window(
-        self, keys: dict[str, Any] | None, idle: Any, rate: int | None, act: Callable[[], Any] | None = None
+        self, keys: dict[str, Any] | None, idle: Any, rate: int | None, gamepad: Gamepad | None = None
     ) -> None:
         """Let a person play in a window, until all episodes are recorded or it is closed.
 
@@ -138,7 +137,7 @@ class Recorder(gymnasium.Wrapper):
           keys: an action for each key, or for several that are pressed together; None: those of the environment.
           idle: the action while no key is pressed.
           rate: steps a second; None: the environment's own.
-          act: chooses the actions in place of keys, such as `Gamepad.action`.
+          gamepad: chooses the actions in place of keys; it is closed at the end.
 
         Raises EnvironmentSetupError if there is no window or there are no keys, and DatasetError.
         """
@@ -150,8 +149,8 @@ class Recorder(gymnasium.Wrapper):
             raise EnvironmentSetupError(f"a window needs pygame: {INSTALL_PYGAME}") from None
         import pygame
 
-        space, self._act = self.action_space, act
-        actions = {} if act is not None else keys
+        space, self._gamepad = self.action_space, gamepad
+        actions = {} if gamepad is not None else keys
         if actions is not None:
             actions = {"".join(key): action_of(space, value) for key, value in actions.items()}
         try:
@@ -169,6 +168,8 @@ class Recorder(gymnasium.Wrapper):
         except (pygame.error, ValueError, TypeError) as error:
             raise EnvironmentSetupError(f"nobody can play in a window: {error}") from None
         finally:
+            if gamepad is not None:
+                gamepad.close()
             pygame.quit()
 
     def _check_picture(self) -> None:

@@ -114,6 +114,13 @@ class Gamepad:
             return self._pressed[held]
         return self._moved(moved) if self._axes else self._idle
 
+    def close(self) -> None:
+        """Release the gamepad. Call this before pygame.quit(), after which SDL would crash at the next one."""
+        from pygame._sdl2 import controller
+
+        self._controller.quit()
+        controller.quit()
+
     def _moved(self, moved: Mapping[str, float]) -> Any:
         rest = np.array(self._idle, np.float64).ravel()
         low, high = (bound.ravel() for bound in _bounds(self._space))

@@ -195,7 +195,7 @@ def _record(
         if parsed.by == _GAMEPAD:
             space = environment.action_space
             pressed = {frozenset(names.split(",")): action_of(space, action) for names, action in (keys or {}).items()}
-            gamepad = Gamepad(space, action_of(space, idle), pressed, axes).action
+            gamepad = Gamepad(space, action_of(space, idle), pressed, axes)
         if player is None and not by_person:
             player = BotPlayer(parsed.by, environment.action_space, modules)
         spaces = environment.observation_space, environment.action_space

@@ -2,6 +2,7 @@
 
 import ctypes
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,12 @@ def pad(sdl: None) -> VirtualPad:
     return VirtualPad()
 
 
+@pytest.fixture
+def hold(pad: VirtualPad) -> Iterator[Callable[..., Gamepad]]:
+    with ExitStack() as stack:
+        yield lambda *arguments: stack.enter_context(closing(Gamepad(*arguments)))
+
+
 CAR = gymnasium.spaces.Box(np.array([-1.0, 0.0, 0.0], np.float32), np.array([1.0, 1.0, 0.5], np.float32))
 STILL = np.zeros(3, np.float32)
 
@@ -69,10 +76,10 @@ def names(*pressed: str) -> frozenset[str]:
     return frozenset(pressed)
 
 
-def test_axes_move_numbers_and_buttons_replace_them(pad: VirtualPad) -> None:
+def test_axes_move_numbers_and_buttons_replace_them(pad: VirtualPad, hold: Callable[..., Gamepad]) -> None:
     brake = np.array([0.0, 0.0, 0.5], np.float32)
     axes = [("leftx", 0, False), ("righttrigger", 1, False), ("righty", 1, True)]
-    held = Gamepad(CAR, STILL, {names("b"): brake, names("b", "dpup"): STILL}, axes)
+    held = hold(CAR, STILL, {names("b"): brake, names("b", "dpup"): STILL}, axes)
     for moved, expected in (
         ({}, [0.0, 0.0, 0.0]),
         ({"leftx": -1.0, "righttrigger": 1.0}, [-1.0, 1.0, 0.0]),
@@ -95,10 +102,10 @@ def test_axes_move_numbers_and_buttons_replace_them(pad: VirtualPad) -> None:
 
 
 def test_without_words_triggers_and_sticks_are_given_out_and_explained(
-    pad: VirtualPad, caplog: pytest.LogCaptureFixture
+    pad: VirtualPad, hold: Callable[..., Gamepad], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    held = Gamepad(CAR, STILL, {}, [])
+    held = hold(CAR, STILL, {}, [])
     pad.hold("x", leftx=1.0, righttrigger=1.0, lefttrigger=1.0)
     np.testing.assert_allclose(held.action(), [1.0, 1.0, 0.5])
     held.action()
