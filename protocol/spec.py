@@ -303,8 +303,7 @@ class LossSpec(Specification):
     rewards, small ones are not scaled up, such as those of a task that is solved."""
 
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Precision of the forward passes. `auto`: bfloat16 for convolutions, and for `sac` on the CPU, where the hardware
-    multiplies it."""
+    """Precision of the forward passes. `auto`: bfloat16 for convolutions where the hardware multiplies it."""
 
     @property
     def user_modules(self) -> dict[str, str]:

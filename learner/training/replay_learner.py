@@ -43,8 +43,7 @@ class ReplayLearner(Learner):
         algorithm = self._gradients.algorithm
         assert isinstance(algorithm, Sac)
         network = self._network
-        gains = network.convolutional or (self.device.type == "cpu" and not network.has_user_modules)
-        mixed = is_mixed(spec.precision, self.device, gains)
+        mixed = is_mixed(spec.precision, self.device, network.convolutional)
         critics = TwinCritics(run.policy, spaces, modules).to(self.device)
         algorithm.build(critics, network, target_rate=spec.target_rate, is_mixed=mixed)
         self._algorithm = algorithm
