@@ -22,12 +22,12 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec
 
 
-def is_mixed(precision: Literal["auto", "float32", "bfloat16"], device: torch.device, gains: bool) -> bool:
+def is_mixed(precision: Literal["auto", "float32", "bfloat16"], device: torch.device, convolutional: bool) -> bool:
     """Return whether forward passes compute in bfloat16: if it is requested or known to be faster.
 
-    "auto" means bfloat16 where the network `gains` from it, on a device that multiplies bfloat16 in hardware.
+    "auto" means bfloat16 for a convolutional network on a device that multiplies bfloat16 in hardware.
     """
-    return precision == "bfloat16" or (precision == "auto" and gains and _multiplies_bfloat16(device))
+    return precision == "bfloat16" or (precision == "auto" and convolutional and _multiplies_bfloat16(device))
 
 
 def _multiplies_bfloat16(device: torch.device) -> bool:

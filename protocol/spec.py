@@ -418,7 +418,8 @@ class TrainingSpec(LossSpec):
     device: Literal["cpu", "cuda"] = "cpu"
     """Device of the learner."""
     threads: PositiveInt = 1
-    """Threads of the learner. More than one is slower if actors use the same cores."""
+    """Threads of the learner. More than one is slower if actors use the same cores. `sac` on a CPU uses another one for
+    the gradient of its policy."""
 
     def exploration_annealing(self, progress: float, env_steps: int) -> float:
         """Return how much of epsilon's way from 1 to its final value is left, from 1 to 0.

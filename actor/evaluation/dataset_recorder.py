@@ -98,9 +98,9 @@ class Recorder(gymnasium.Wrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and write the episode if it ends. Raises DatasetError."""
-        # Environments and players may use the same arrays again.
         if self._gamepad is not None:
             action = self._gamepad.action()
+        # Environments and players may use the same arrays again.
         self._actions.append(copy.deepcopy(action))
         result = observation, reward, terminated, truncated, _ = self.env.step(action)
         self._observations.append(copy.deepcopy(observation))

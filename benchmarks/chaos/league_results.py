@@ -2,14 +2,9 @@
 
 import random
 import signal
-import sys
-import time
 from collections import defaultdict
-from pathlib import Path
 
-from processes import Running
-
-from benchmarks.chaos.scene import ENDLESS, FailedError, say, scene
+from benchmarks.chaos.scene import ENDLESS, FailedError, JournalActors, say, scene
 
 _ACTORS = 8
 # Answers that mean that the results of a rollout were counted: now, or when it arrived before.
@@ -30,41 +25,21 @@ def league(kills: int) -> list[tuple[str, str]]:
         # The budget is so large that only one version is kept: matches of dropped versions would leave the status.
         command = ("learner", "tic_tac_toe", "--resume", "--run-dir", "run", "--connect", here.address, *ENDLESS)
         learner = here.start(*command)
-        journal = [sys.executable, str(Path(__file__).with_name("journal.py")), here.address]
-        names = [f"actor-{number}" for number in range(_ACTORS)]
-        actors = dict[str, Running]()
-
-        def begin(name: str, life: int) -> None:
-            twice = ("twice",) if name == names[0] else ()
-            actors[name] = here.run([*journal, name, str(here.folder / f"journal-{name}-{life}"), *twice])
-
-        for name in names:
-            begin(name, 0)
-        here.wait_for_training(*names)
+        actors = JournalActors(here, _ACTORS)
         for number in range(kills):
             if number == kills // 2:
                 learner.process.send_signal(signal.SIGTERM)
                 learner.wait()
                 learner = here.start(*command)
                 say("the learner is restarted")
-            name = choose.choice(names)
-            time.sleep(choose.uniform(0.0, 2.0))
-            actors[name].process.kill()
-            actors[name].wait()
-            begin(name, number + 1)
-            here.wait_for_training(name)
+            name = actors.kill_one(choose)
             say(f"kill {number + 1} of {kills}: {name} is back")
-        for actor in actors.values():
-            actor.process.terminate()
-        for actor in actors.values():
-            actor.wait()
-        here.wait("all actors gone", lambda: (now := here.status()) is not None and not now.actors_alive)
-        here.wait("the end of the queue", lambda: (now := here.status()) is not None and not now.queue_bytes)
+        actors.end()
         status = here.status()
         if status is None or status.league is None or status.league.left_out:
             raise FailedError("the status has no complete league")
         players = status.league.players
-        lines = [line for path in here.folder.glob("journal-*") for line in path.read_text().splitlines()]
+        lines = actors.lines()
     matches, answers = dict[str, int](), defaultdict[str, list[str]](list)
     for kind, name, rest in (line.split(" ", 2) for line in lines):
         if kind == "sent":

@@ -3,7 +3,6 @@
 import random
 import signal
 import statistics
-import sys
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -12,7 +11,7 @@ import safetensors.numpy
 from processes import Running
 
 from benchmarks.chaos.journal import digests
-from benchmarks.chaos.scene import ENDLESS, FailedError, Scene, say, scene
+from benchmarks.chaos.scene import ENDLESS, FailedError, JournalActors, Scene, say, scene
 from benchmarks.slow_actors import MODULE, provide_environment
 
 _ACTORS = 8
@@ -42,18 +41,8 @@ def replay(kills: int) -> list[tuple[str, str]]:
         provide_environment(here.folder)
         here.router()
         learner = _learner(here, "--resume")
-        journal = [sys.executable, str(Path(__file__).with_name("journal.py")), here.address]
-        names = [f"actor-{number}" for number in range(_ACTORS)]
-        actors = dict[str, Running]()
+        actors = JournalActors(here, _ACTORS, ("rows", MODULE))
         ended = list[int]()  # epochs of learners that were killed
-
-        def begin(name: str, life: int) -> None:
-            words = ("rows", MODULE, *(("twice",) if name == names[0] else ()))
-            actors[name] = here.run([*journal, name, str(here.folder / f"journal-{name}-{life}"), *words])
-
-        for name in names:
-            begin(name, 0)
-        here.wait_for_training(*names)
         for number in range(kills):
             if number in restarts:
                 status = here.status()
@@ -64,23 +53,13 @@ def replay(kills: int) -> list[tuple[str, str]]:
                 learner.wait()
                 learner = _learner(here, "--resume")
                 say(f"the learner is restarted after {restarts[number].name}")
-            name = choose.choice(names)
-            time.sleep(choose.uniform(0.0, 2.0))
-            actors[name].process.kill()
-            actors[name].wait()
-            begin(name, number + 1)
-            here.wait_for_training(name)
+            name = actors.kill_one(choose)
             say(f"kill {number + 1} of {kills}: {name} is back")
-        for actor in actors.values():
-            actor.process.terminate()
-        for actor in actors.values():
-            actor.wait()
-        here.wait("all actors gone", lambda: (now := here.status()) is not None and not now.actors_alive)
-        here.wait("the end of the queue", lambda: (now := here.status()) is not None and not now.queue_bytes)
+        actors.end()
         learner.process.send_signal(signal.SIGTERM)
         learner.wait()
         stored = _stored(here.folder / "run" / "replay")
-        lines = [line for path in here.folder.glob("journal-*") for line in path.read_text().splitlines()]
+        lines = actors.lines()
     rows, answers = dict[str, list[str]](), defaultdict[str, set[str]](set)
     for kind, name, *rest in (line.split(" ") for line in lines):
         if kind == "rows":

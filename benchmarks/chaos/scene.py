@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import random
 import signal
 import socket
 import sys
@@ -137,6 +138,52 @@ class Scene:
                 running.process.wait(10.0)
             running.end()
         self._folder.cleanup()
+
+
+class JournalActors:
+    """Actors that write journals of what they send (journal.py); one after the other is killed and started again."""
+
+    def __init__(self, here: Scene, count: int, words: Sequence[str] = ()) -> None:
+        """Start them, and wait until all are trained on. `words` are further ones of journal.py.
+
+        The first actor sends all rollouts twice.
+        """
+        self._here, self._words, self._kills = here, words, 0
+        self._names = [f"actor-{number}" for number in range(count)]
+        self._running = {name: self._started(name) for name in self._names}
+        here.wait_for_training(*self._names)
+
+    def _started(self, name: str) -> Running:
+        journal = [sys.executable, str(Path(__file__).with_name("journal.py")), self._here.address, name]
+        twice = ("twice",) if name == self._names[0] else ()
+        return self._here.run(
+            [*journal, str(self._here.folder / f"journal-{name}-{self._kills}"), *self._words, *twice]
+        )
+
+    def kill_one(self, choose: random.Random) -> str:
+        """Kill one within two seconds, and return its name once it is back and trained on."""
+        name = choose.choice(self._names)
+        time.sleep(choose.uniform(0.0, 2.0))
+        self._running[name].process.kill()
+        self._running[name].wait()
+        self._kills += 1
+        self._running[name] = self._started(name)
+        self._here.wait_for_training(name)
+        return name
+
+    def end(self) -> None:
+        """Let all leave, and wait until the learner has decoded what they sent."""
+        for actor in self._running.values():
+            actor.process.terminate()
+        for actor in self._running.values():
+            actor.wait()
+        here = self._here
+        here.wait("all actors gone", lambda: (now := here.status()) is not None and not now.actors_alive)
+        here.wait("the end of the queue", lambda: (now := here.status()) is not None and not now.queue_bytes)
+
+    def lines(self) -> list[str]:
+        """Return the lines of all journals."""
+        return [line for path in self._here.folder.glob("journal-*") for line in path.read_text().splitlines()]
 
 
 @contextlib.contextmanager

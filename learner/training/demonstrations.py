@@ -150,7 +150,7 @@ class Cloning:
 
 
 class _Sequences:
-    """Several sequences of steps, each of one episode after the other, in an order drawn at random for each pass."""
+    """Sequences of steps, which go through whole episodes in random order; each episode is used before any again."""
 
     def __init__(self, rows: np.ndarray) -> None:
         """`rows` are those of the episodes, in order."""

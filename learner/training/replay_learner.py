@@ -42,10 +42,9 @@ class ReplayLearner(Learner):
         super().__init__(spec, run.policy, spaces, modules)
         algorithm = self._gradients.algorithm
         assert isinstance(algorithm, Sac)
-        network = self._network
-        mixed = is_mixed(spec.precision, self.device, network.convolutional)
+        mixed = is_mixed(spec.precision, self.device, self._network.convolutional)
         critics = TwinCritics(run.policy, spaces, modules).to(self.device)
-        algorithm.build(critics, network, target_rate=spec.target_rate, is_mixed=mixed)
+        algorithm.build(critics, self._network, target_rate=spec.target_rate, is_mixed=mixed)
         self._algorithm = algorithm
         self._learned = {"policy": self._flat.values, **algorithm.learned}
         self._optimizers = {

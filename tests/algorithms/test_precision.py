@@ -15,7 +15,7 @@ def test_auto_is_bfloat16_on_a_gpu_that_multiplies_it_in_hardware(
         torch.cuda, "is_bf16_supported", lambda including_emulation=True: in_hardware or including_emulation
     )
     gpu = torch.device("cuda")
-    assert is_mixed("auto", gpu, gains=True) == in_hardware
-    assert not is_mixed("auto", gpu, gains=False)
-    assert is_mixed("bfloat16", gpu, gains=False)
-    assert not is_mixed("float32", gpu, gains=True)
+    assert is_mixed("auto", gpu, convolutional=True) == in_hardware
+    assert not is_mixed("auto", gpu, convolutional=False)
+    assert is_mixed("bfloat16", gpu, convolutional=False)
+    assert not is_mixed("float32", gpu, convolutional=True)
