@@ -23,6 +23,7 @@ from daedalus.policy.user_code import names_place
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.transport.process_usage import available_processors
 
 if TYPE_CHECKING:
     from daedalus.actor.checking.check_report import EnvironmentReport
@@ -279,7 +280,7 @@ def with_measured_processes(
     """
     from daedalus.actor.checking.check_report import slow_steps
 
-    slow = slow_steps(report, spec_with(defaults), os.cpu_count() or 1)
+    slow = slow_steps(report, spec_with(defaults), available_processors())
     if not slow:
         return defaults, ""
     changed = {**defaults, "environment": {**defaults.get("environment", {}), "processes": True}}
@@ -311,7 +312,7 @@ def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "Envir
 def _log_advice(report: "EnvironmentReport", spec: RunSpec) -> None:
     from daedalus.actor.checking.check_report import advice
 
-    for text in advice(report, spec, os.cpu_count() or 1):
+    for text in advice(report, spec, available_processors()):
         _logger.info("%s", text)
 
 

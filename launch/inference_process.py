@@ -36,6 +36,7 @@ from daedalus.policy.acting.shared_runtime import PACKET_BYTES, Region
 from daedalus.policy.user_code import message_line
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LearningSpec
+from daedalus.transport.process_usage import available_processors
 
 _logger = logging.getLogger(__name__)
 
@@ -275,7 +276,7 @@ def main() -> int:
     if parsed.exit_with_parent:
         exit_with_parent(stop)
     raise_descriptor_limit()  # an actor has three
-    threads = max(len(os.sched_getaffinity(0)) // 2, 1)  # actors that wait leave their cores
+    threads = max(available_processors() // 2, 1)  # actors that wait leave their cores
     Inference(parsed.device, threads, stop).serve(parsed.path)
     return 0
 

@@ -49,6 +49,7 @@ from daedalus.protocol.league import version_name
 from daedalus.protocol.texts import one_line
 from daedalus.transport.addresses import socket_path
 from daedalus.transport.private_address import private_address
+from daedalus.transport.process_usage import available_processors
 
 _logger = logging.getLogger(__name__)
 
@@ -296,7 +297,7 @@ def evaluate_run(
     """
     if not (run.directory / run_directory.SUMMARY).exists():  # the learner has said why
         raise UnsavedError(f"the summary of the run could not be saved: {_remedy(run)}")
-    most = min(len(candidates(run.directory)) or 1, os.cpu_count() or 1)
+    most = min(len(candidates(run.directory)) or 1, available_processors())
     opponents = _final_opponents(run)
     names = [] if opponents else [f"evaluation-{number}" for number in range(most)]
     options = *helper_log_words(run.logs), *allow_settings(run.spec.environment.user_modules)

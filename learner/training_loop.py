@@ -150,7 +150,7 @@ class TrainingLoop:
         """Let a replay buffer have the rollouts that were accepted, but not yet taken, when the run was stopped."""
         rollouts = self._server.rollouts
         while self._context.spec.algorithm.replay and not self._context.is_finished:
-            batch = rollouts.take_batch(self._learner.policy_version)
+            batch = rollouts.take_batch(self._learner.policy_version, complete=False)
             if not batch:
                 return
             left_out = self._learn_from(batch, self._context.progress)

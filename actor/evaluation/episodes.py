@@ -1,6 +1,5 @@
 """Whole episodes played with a policy, and their returns. No network, no threads."""
 
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import Spaces, unfit_number
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, EvaluationSpec
 from daedalus.protocol.texts import short_number
+from daedalus.transport.process_usage import available_processors
 
 _Components = dict[str, np.ndarray]
 
@@ -140,7 +140,7 @@ def environments_for(episodes: int, spec: EnvironmentSpec, collection: Collectio
     """
     most = min(_MAX_ENVIRONMENTS, collection.actors * collection.envs_per_actor)
     if spec.processes and spec.backend == "gymnasium":
-        most = min(most, _ENVIRONMENTS_PER_PROCESSOR * (os.cpu_count() or 1))
+        most = min(most, _ENVIRONMENTS_PER_PROCESSOR * available_processors())
     return min(episodes, most)
 
 

@@ -1,7 +1,6 @@
 """`daedalus check`: play an environment with random actions; report its faults, its speed and what train chooses."""
 
 import argparse
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -26,6 +25,7 @@ from daedalus.protocol.league import is_bot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import short_number
+from daedalus.transport.process_usage import available_processors
 
 _DESCRIPTION = """\
 Makes one environment and plays it with random actions: whether reset and step keep to gymnasium's interface, whether
@@ -163,7 +163,7 @@ def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
     if report.problems:
         return []
     endless = never_ends(report, spec)
-    return [*([endless] if endless else []), *advice(report, spec, os.cpu_count() or 1)]
+    return [*([endless] if endless else []), *advice(report, spec, available_processors())]
 
 
 def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tuple[str, str]:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from pydantic import BaseModel, Field, ValidationError
 
-from daedalus.learner.run.process_resources import available_memory
 from daedalus.learner.run.run_directory import DEMONSTRATIONS
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.upload_checks import first_component_violation, number_violation
@@ -21,6 +20,7 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 from daedalus.protocol.texts import exact_number
 from daedalus.protocol.uploads import Rollout
+from daedalus.transport.process_usage import available_memory
 
 MEMORY_SHARE = 0.75  # of what is available
 PART_BYTES = 16 << 20  # about the largest part in memory

@@ -1,4 +1,4 @@
-"""What a learner process sets up with the operating system, or asks it: descriptors, an allocator, free memory.
+"""What a learner process sets up with the operating system: descriptors, and an allocator.
 
 Connections of peers use up all file descriptors that are not reserved for the files of the run. A connection is
 accepted by the network's own threads, before anybody knows whose it is. So the limit of this process stays below what
@@ -7,11 +7,9 @@ the system allows, and is raised only while a thread writes files.
 
 import contextlib
 import ctypes
-import re
 import sys
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 _LARGEST_SHARE = 8  # part of all descriptors, at most
 
@@ -76,24 +74,3 @@ def keep_freed_memory() -> None:
         return
     mallopt(_M_MMAP_THRESHOLD, 1 << 30)
     mallopt(_M_TRIM_THRESHOLD, _NEVER)
-
-
-_CONTROL_GROUP = Path("/sys/fs/cgroup")  # that of this process, as a container sees it
-
-
-def available_memory() -> int | None:
-    """Return the bytes of memory that this process can still take, or None where the system does not say."""
-    found = []
-    try:
-        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
-        found += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable:")]
-    except (OSError, ValueError, IndexError):
-        pass
-    try:
-        names = ("memory.max", "memory.current", "memory.stat")
-        limit, used, statistics = ((_CONTROL_GROUP / name).read_text("ascii") for name in names)
-        files = re.search(r"^inactive_file (\d+)$", statistics, re.MULTILINE)  # read before, and given up when needed
-        found.append(max(int(limit) - int(used) + (int(files[1]) if files else 0), 0))  # the limit may be "max"
-    except (OSError, ValueError):
-        pass
-    return min(found, default=None)

@@ -37,6 +37,7 @@ from daedalus.policy.saving.sealed import remove_sealed
 from daedalus.protocol import keys
 from daedalus.protocol.releases import as_release, own_release, remedy
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.process_usage import available_processors
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
 OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
@@ -285,7 +286,7 @@ def _versions() -> dict[str, Any]:
     import importlib.metadata  # imported here, because only a new run needs it
 
     versions: dict[str, Any] = {"python": platform.python_version(), "platform": platform.platform()}
-    versions["processors"] = os.cpu_count()
+    versions["processors"] = available_processors()
     for package in _PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)

@@ -127,13 +127,14 @@ class RolloutBuffer(Protocol):
         """Record that an actor sent a rollout, which may have come too late for `add`."""
         ...
 
-    def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
+    def take(self, live: Set[str], policy_version: int, now: float, *, complete: bool = True) -> TakenRollouts:
         """Take the next batch if it is complete, else no rollouts.
 
         Args:
           live: names of the live actors.
           policy_version: newest policy version; rollouts beyond the policy lag bound are returned as stale.
           now: time on the monotonic clock, in seconds.
+          complete: False: take what is there, at the end of a run.
         """
         ...
 
@@ -182,13 +183,13 @@ class BarrierBuffer:
         """See RolloutBuffer."""
         self._stragglers.heard(actor)
 
-    def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
+    def take(self, live: Set[str], policy_version: int, now: float, *, complete: bool = True) -> TakenRollouts:
         """See RolloutBuffer."""
         awaited = self._stragglers.awaited(live, self._waiting.keys(), now)
         is_first = not self._started and len(live) < self._first
-        if (is_first or awaited or not self._waiting) and not self._is_full:
+        if not self._waiting or (complete and (is_first or awaited) and not self._is_full):
             return TakenRollouts(rollouts=[], stale=[])
-        if is_first or awaited:
+        if complete and (is_first or awaited):
             _logger.warning(
                 "a batch has only %d rollouts, because these fill %d MiB of memory",
                 len(self._waiting),
@@ -240,12 +241,13 @@ class StreamBuffer:
         """See RolloutBuffer. Always empty."""
         return frozenset()
 
-    def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
+    def take(self, live: Set[str], policy_version: int, now: float, *, complete: bool = True) -> TakenRollouts:
         """See RolloutBuffer."""
         oldest = policy_version - self._policy_lag_bound_with(len(live))
         stale = [rollout for rollout in self._waiting if rollout.policy_version < oldest]
         if stale:
             self._waiting = deque(rollout for rollout in self._waiting if rollout.policy_version >= oldest)
-        if len(self._waiting) < self._batch_rollouts:
+        count = self._batch_rollouts if complete else min(self._batch_rollouts, len(self._waiting))
+        if len(self._waiting) < count:
             return TakenRollouts(rollouts=[], stale=stale)
-        return TakenRollouts(rollouts=[self._waiting.popleft() for _ in range(self._batch_rollouts)], stale=stale)
+        return TakenRollouts(rollouts=[self._waiting.popleft() for _ in range(count)], stale=stale)

@@ -247,7 +247,7 @@ class RolloutIntake:
 
     # ------------------------------------------------------------------------------------ the learner's thread
 
-    def take_batch(self, version: int) -> list[Upload]:
+    def take_batch(self, version: int, *, complete: bool = True) -> list[Upload]:
         """Return the rollouts of the next batch, or an empty list if no batch is complete within POLL_SECONDS.
 
         The rollouts are counted as trained. From now on the policy lag is relative to the version after this batch,
@@ -255,14 +255,15 @@ class RolloutIntake:
 
         Args:
           version: newest policy version, before this batch.
+          complete: False: at the end of a run, what is there is a batch.
         """
         with self._lock:
             self._held.release()
             self._requests.wake()  # the intake thread answers: a congested link must not stop the learner
-            taken = self._take(version)
-            if not taken.rollouts and not taken.stale:
+            taken = self._take(version, complete)
+            if not taken.rollouts and not taken.stale and complete:
                 self._lock.wait(POLL_SECONDS)
-                taken = self._take(version)
+                taken = self._take(version, complete)
             self._count(taken, version)
             if taken.rollouts:
                 self._held.begin(time.monotonic())
@@ -312,10 +313,10 @@ class RolloutIntake:
             text = f"quarantined: {actor.quarantined}"
             self._events.add("quarantined", text, actor=name, level=logging.WARNING)
 
-    def _take(self, version: int) -> TakenRollouts:
+    def _take(self, version: int, complete: bool) -> TakenRollouts:
         live = self._fleet.live
         self._requests.max_requests = _most_requests(self._spec, len(live))
-        taken = self._buffer.take(live, version, time.monotonic())
+        taken = self._buffer.take(live, version, time.monotonic(), complete=complete)
         self._named &= self._fleet.actors.keys()
         for name in sorted(self._buffer.left_out - self._named):
             self._named.add(name)

@@ -13,7 +13,6 @@ from torch import Tensor
 from daedalus.algorithms.gradients import Terms, is_mixed
 from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions, joined
 from daedalus.algorithms.sac import Sac, TwinCritics
-from daedalus.learner.run.process_resources import available_memory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.optimizers import build_optimizer
@@ -23,6 +22,7 @@ from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout, Upload
+from daedalus.transport.process_usage import available_memory
 
 _SLICE_SECONDS = 0.5  # of updates at a time: evaluators, orders and signals wait meanwhile
 _MEMORY_SHARE = 0.75  # of what is available, where the run does not say

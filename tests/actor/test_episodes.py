@@ -1,6 +1,5 @@
 """play_episodes: whole episodes in rounds, one in each environment."""
 
-import os
 import re
 from typing import Any
 
@@ -17,6 +16,7 @@ from daedalus.actor.evaluation.episodes import environments_for, play_episodes
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
+from daedalus.transport.process_usage import available_processors
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 
@@ -186,7 +186,7 @@ def test_environments_in_processes_are_limited_per_processor() -> None:
     processes, many = EnvironmentSpec(id="CarRacing-v3", processes=True), CollectionSpec(actors=64, envs_per_actor=64)
     assert environments_for(7, COUNTING, many) == 7
     assert environments_for(1000, COUNTING, many) == 100
-    assert environments_for(1000, processes, many) == 4 * (os.cpu_count() or 1)
+    assert environments_for(1000, processes, many) == 4 * available_processors()
     assert environments_for(2, processes, many) == 2
     assert environments_for(1000, processes.model_copy(update={"backend": "envpool"}), many) == 100
 
@@ -194,4 +194,4 @@ def test_environments_in_processes_are_limited_per_processor() -> None:
 def test_evaluation_has_no_more_environments_than_training() -> None:
     few = CollectionSpec(actors=2, envs_per_actor=3)
     assert environments_for(1000, COUNTING, few) == 6
-    assert environments_for(1000, EnvironmentSpec(id="A-v0", processes=True), few) == min(6, 4 * (os.cpu_count() or 1))
+    assert environments_for(1000, EnvironmentSpec(id="A-v0", processes=True), few) == min(6, 4 * available_processors())

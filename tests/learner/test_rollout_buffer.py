@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daedalus.learner.serving import rollout_intake
-from daedalus.learner.serving.rollout_buffer import BarrierBuffer, StreamBuffer, TakenRollouts
+from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.learner.serving.rollout_intake import HeldAnswers, RequestQueue
 from daedalus.protocol.uploads import Rollout, Upload
 from daedalus.transport.interface import Request
@@ -88,6 +88,14 @@ def test_stream_returns_rollouts_of_all_actors_in_order_of_arrival() -> None:
     assert buffer.take({"a"}, 0, 0.0).rollouts == []
     buffer.add(rollout("b", 3))
     assert sequences(buffer.take(set(), 0, 0.0).rollouts) == [2, 3]
+
+
+@pytest.mark.parametrize("buffer", [StreamBuffer(3, lambda _live: 0), BarrierBuffer(2, lambda: 1 << 30)])
+def test_at_the_end_of_a_run_what_is_there_is_a_batch(buffer: RolloutBuffer) -> None:
+    buffer.add(rollout("a"))
+    assert buffer.take({"a", "b"}, 0, 0.0).rollouts == []
+    assert actors(buffer.take({"a", "b"}, 0, 0.0, complete=False)) == ["a"]
+    assert buffer.take({"a", "b"}, 0, 0.0, complete=False).rollouts == []
 
 
 def test_stream_returns_stale_rollouts_separately() -> None:
