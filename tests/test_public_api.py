@@ -4,6 +4,7 @@ import ast
 import inspect
 import json
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -87,19 +88,6 @@ def test_train_returns_the_result_in_another_thread(tmp_path: Path, capfd: pytes
     assert not processes_mentioning("from-a-thread")
     policy = daedalus.load_policy(directory)
     assert policy.policy_version == result.updates
-
-
-def test_train_prints_its_log_records_and_the_output_of_its_processes(tmp_path: Path) -> None:
-    settings = {**BUDGET, "env": "CartPole-v1", "run_dir": "run"}
-    program = (
-        f"import daedalus, logging; result = daedalus.train(**{settings});"
-        " print(logging.getLogger('daedalus').handlers, result.exit_status, result.solved)"
-    )
-    output = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
-    lines = output.stdout.splitlines()
-    assert lines[-1] == "[] 0 False"  # no target: all steps were done
-    assert any(line.startswith("CartPole-v1: appo, seed 1, 1 actors") for line in lines)
-    assert any("  env_steps  " in line for line in lines)  # printed by the learner
 
 
 def test_a_callback_logs_metrics_and_ends_training(tmp_path: Path) -> None:
@@ -209,18 +197,26 @@ def test_a_script_without_a_guard_is_reported(tmp_path: Path) -> None:
     assert 'put the call under `if __name__ == "__main__":`' in ended.stderr
 
 
-def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:
-    program = (
-        # a shell starts background jobs with SIGINT ignored, and Python leaves it so
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-        " import daedalus; daedalus.train('cartpole', run_dir='interrupted-run', env_steps=10**9,"
-        " settings={'training.stop_when_solved': False})"
-    )
+def test_train_prints_what_its_processes_print_and_ctrl_c_ends_them_with_a_checkpoint(tmp_path: Path) -> None:
+    # a shell starts background jobs with SIGINT ignored, and Python leaves it so
+    program = """
+import logging, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import daedalus
+settings = {"training.stop_when_solved": False, "environment.id": "slow_environment:Slow-v0"}
+try:
+    daedalus.train("cartpole", run_dir="interrupted-run", env_steps=10**9, settings=settings)
+finally:
+    print(logging.getLogger("daedalus").handlers, flush=True)
+"""
+    shutil.copy(Path(__file__).parent / "slow_environment.py", tmp_path)
     running = Running([sys.executable, "-c", program], tmp_path)
     try:
-        running.expect(r"updates .*/s")
+        running.expect(r"slow_environment:Slow-v0: impala, seed 1, \d+ actors")  # of the log
+        running.expect(r"  env_steps  .* updates .*/s")  # printed by the learner
         running.process.send_signal(signal.SIGINT)
         assert running.wait() != 0
+        assert "[]" in running.lines
         assert running.lines[-1] == "KeyboardInterrupt", running.output
         until(lambda: not processes_mentioning("interrupted-run"))
         assert any((tmp_path / "interrupted-run" / "checkpoints").iterdir())

@@ -77,26 +77,26 @@ def test_hosts_reach_only_each_other_and_are_removed_at_the_end(tmp_path: Path, 
     assert sleeper.process.poll() is not None
 
 
-def test_actors_on_three_hosts_train_over_tls_until_the_end_of_the_run(tmp_path: Path, network: Network) -> None:
+def test_actors_on_other_hosts_train_over_tls_until_the_end_of_the_run(tmp_path: Path, network: Network) -> None:
     central = network.host("learner")
-    players = [network.host(name) for name in ("arm", "box", "car")]
+    players = [network.host(name) for name in ("arm", "box")]
     folder = tmp_path / "certs"
     assert certs(["init", str(folder), "--host", central.address]) == 0
-    change_certificates(folder, "issue actor arm box car")
+    change_certificates(folder, "issue actor arm box")
     address = address_of(central, "tls")
     words = ("actor", "--connect", address, *PLAYING_SLOW, "--tls")
     actors = [host.start(*words, folder / f"actor-{host.name}") for host in players]
     for actor in actors:
         actor.expect("nothing answers .* waiting for it")  # all actors take part from the start of the run
     everywhere = ("--listen", f"tls/0.0.0.0:{PORT}", "--tls", folder / "learner")
-    budget = (*ENDLESS[:2], *SLOW, "--env-steps", 6_000)
+    budget = (*ENDLESS[:2], *SLOW, "--env-steps", 1_500)
     learner = central.start("learner", "cartpole", *everywhere, "--run-dir", "run", *budget)
     for host, actor in zip(players, actors, strict=True):
         actor.expect(rf"joined run 'run' as '{host.name}\.[\w-]+-\d+'")
     assert learner.wait() in (0, 3), learner.output
     for actor in actors:
         assert actor.wait() == 0, actor.output
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["env_steps"] >= 6_000
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["env_steps"] >= 1_500
 
 
 def test_actors_are_noticed_as_gone_when_their_link_fails_and_return_when_it_works(network: Network) -> None:

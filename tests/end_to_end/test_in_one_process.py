@@ -114,7 +114,7 @@ def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, alg
     assert returns == counters["env_steps"]  # each valid row of both learners counts once
 
 
-SETTINGS = ("training.env_steps=24000", "training.stop_when_solved=false")
+SETTINGS = ("training.env_steps=12000", "training.stop_when_solved=false")
 NORMALIZATION = (
     "evaluation.final_episodes=1",
     "policy.normalize_observations=true",
@@ -142,7 +142,7 @@ def test_one_actor_gives_equal_weights_with_rollouts_and_with_gradients(tmp_path
     settings = read_preset("cartpole")
     choose_algorithm(settings, "a2c")
     annealed = ("training.entropy_bonus=0.02", "training.entropy_bonus_final=0.001", "collection.actors=1")
-    override(settings, (*SETTINGS, *NORMALIZATION, *annealed, "training.env_steps=12000"))
+    override(settings, (*SETTINGS, *NORMALIZATION, *annealed))
     train_in_one_process(run_spec(settings), tmp_path / "rollouts")
     override(settings, (GRADIENTS,))
     train_in_one_process(run_spec(settings), tmp_path / "gradients")

@@ -26,19 +26,6 @@ def example(tmp_path: Path, address: str) -> Iterator[Callable[..., Running]]:
         one.end()
 
 
-def test_a_learner_trains_from_a_loop_that_the_caller_owns(
-    start: Callable[..., Running], address: str, example: Callable[..., Running]
-) -> None:
-    slow = ("--set", "collection.rollout_length=64", "--set", "training.batch_rollouts=4")
-    words = ("learner", "cartpole", "--env-steps", 4000, "--actors", 1, "--listen", address, "--run-dir", "run")
-    learner = start(*words, *slow)
-    loop = example("--name", "robot")
-    loop.expect("joined run 'run' as 'robot': 1 x CartPole-v1")
-    assert learner.wait() == 3, learner.output  # the budget ended without the target
-    assert loop.wait() == 0, loop.output
-    loop.expect("the run is over")
-
-
 @pytest.mark.parametrize(("algorithm", "environments"), [("appo", 1), ("a2c", 3)])
 def test_the_agents_of_one_loop_are_one_actor(
     start: Callable[..., Running],
@@ -95,6 +82,7 @@ def test_a_learner_an_actor_and_a_client_run_to_the_end(address: str, portable: 
     learner.expect("this system has no such locks: start no second learner in")
     actor = portable("-m", "daedalus", "actor", "--connect", address, "--name", "plain", "--envs", 2)
     loop = portable(OWN_LOOP, address, "--name", "robot")
+    loop.expect("joined run 'run' as 'robot': 1 x CartPole-v1")
     assert learner.wait() == 3, learner.output  # the budget ended without the target
     for ended in (actor, loop):
         assert ended.wait() == 0, ended.output
@@ -102,7 +90,7 @@ def test_a_learner_an_actor_and_a_client_run_to_the_end(address: str, portable: 
 
 
 def test_a_training_that_is_stopped_saves_a_checkpoint(portable: Start) -> None:
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9, "--actors", 1)
     training = portable("-m", "daedalus", "train", "cartpole", *endless, "--run-dir", "run")
     training.expect("every user of this machine can connect to tcp/127.0.0.1:")
     training.expect(r" env_steps +[1-9]")

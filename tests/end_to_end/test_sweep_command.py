@@ -7,7 +7,7 @@ from processes import processes_mentioning, starting, until
 
 SETTINGS = (
     "--env-steps",
-    6000,
+    2000,
     "--actors",
     1,
     "--set",

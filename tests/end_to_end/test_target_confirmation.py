@@ -92,27 +92,8 @@ def test_run_ends_at_its_target_if_the_episodes_cannot_be_played(train: Callable
     assert reason in [each.text for each in read_events(tmp_path / "run") if each.kind == "target"][-1]
 
 
-def test_run_that_is_stopped_during_the_confirmation_is_not_solved_and_resumes(
+def test_evaluator_and_learner_that_are_killed_play_and_ask_again_and_a_run_that_is_stopped_is_not_solved(
     train: Callable[..., Running], start: Start, tmp_path: Path
-) -> None:
-    (tmp_path / WAITING).touch()
-    running = train()
-    running.expect("target 1 reached: ")
-    until(lambda: players(tmp_path))
-    running.process.terminate()
-    assert running.wait() == 1, running.output
-    stopped = summary(tmp_path)
-    assert (stopped["solved"], stopped["finished"], "confirmation" in stopped) == (False, False, False)
-    (tmp_path / WAITING).unlink()
-    resumed = start("resume", "run", "--allow-module", "lucky_environment")
-    assert resumed.wait() == 0, resumed.output
-    result = summary(tmp_path)
-    assert result["episodes"] < stopped["episodes"] + 10  # it asks again before it has played as many new episodes
-    assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
-
-
-def test_evaluator_and_then_learner_that_are_killed_during_the_confirmation_play_and_ask_again(
-    train: Callable[..., Running], tmp_path: Path
 ) -> None:
     (tmp_path / WAITING).touch()
     running = train()
@@ -129,8 +110,15 @@ def test_evaluator_and_then_learner_that_are_killed_during_the_confirmation_play
     os.kill(victim, signal.SIGKILL)
     until(lambda: running.output.count("target 1 reached: ") == 2)
     until(lambda: orphan not in players(tmp_path))
+    until(lambda: players(tmp_path))
+    running.process.terminate()
+    assert running.wait() == 1, running.output
+    stopped = summary(tmp_path)
+    assert (stopped["solved"], stopped["finished"], "confirmation" in stopped) == (False, False, False)
     (tmp_path / WAITING).unlink()
-    assert running.wait() == 0, running.output
+    resumed = start("resume", "run", "--allow-module", "lucky_environment")
+    assert resumed.wait() == 0, resumed.output
     result = summary(tmp_path)
+    assert result["episodes"] < stopped["episodes"] + 10  # it asks again before it has played as many new episodes
     assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
     assert result["confirmation"]["policy_version"] == result["updates"]

@@ -172,8 +172,8 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
         ledger.added(life, rollout)
         add(rollout)
 
-    def noted_take(live: Set[str], policy_version: int, now: float) -> TakenRollouts:
-        taken = take(live, policy_version, now)
+    def noted_take(live: Set[str], policy_version: int, now: float, *, complete: bool = True) -> TakenRollouts:
+        taken = take(live, policy_version, now, complete=complete)
         ledger.took(life, taken, policy_version, live - buffer.left_out)
         return taken
 
