@@ -20,7 +20,7 @@ class Transitions(NamedTuple):
 
     observations: Components  # each [B, *stacked_shape]; discrete ones int64
     next_observations: Components  # the same
-    actions: Tensor  # [B, D] float32, all components side by side
+    actions: Tensor  # [B, D] float32, all components side by side; choices as numbers
     rewards: Tensor  # [B], the sum of the discounted rewards up to the next observation
     discounts: Tensor  # [B], of the value of the next observation; 0 after a termination
 
@@ -53,7 +53,7 @@ class ReplayBuffer:
         """Allocate an empty buffer. The system gives the memory when it is first written to.
 
         Args:
-          spaces: components of observations and actions; the actions are continuous.
+          spaces: components of observations and actions.
           rollout_length: T, rows of a column.
           capacity: rows, rounded up to columns.
         """

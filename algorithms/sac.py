@@ -1,4 +1,5 @@
-"""Soft actor-critic: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", algorithm 1.
+"""Soft actor-critic: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", algorithm 1. For a choice
+in place of continuous actions: Christodoulou (2019), "Soft Actor-Critic for Discrete Action Settings".
 
 The critics stay in the learner: the program and the snapshots of the actors are the policy alone.
 """
@@ -19,7 +20,7 @@ from daedalus.algorithms.algorithm import Algorithm, Forward
 from daedalus.algorithms.forward import FlatParameters
 from daedalus.algorithms.recording import OperationRecorder
 from daedalus.algorithms.replay_buffer import Transitions
-from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.actor_critic import ActorCritic, full_precision
 from daedalus.policy.network.encoders import build_encoder, image_encoders
 from daedalus.policy.network.layers import Components, map_components
 from daedalus.policy.user_modules import UserModules
@@ -31,9 +32,11 @@ from daedalus.protocol.spec import PolicySpec
 class TwinCritics(nn.Module):
     """Two critics Q_1(s, a) and Q_2(s, a) with layers of their own, computed at once, and one encoder of images.
 
-    The convolutions of images are the critics': the policy has a copy of them.
+    Continuous actions are inputs. For a choice, the outputs are the values of all its actions. The convolutions of
+    images are the critics': the policy has a copy of them.
 
     Attributes:
+      choices: A, the number of actions of the choice; 0 if the actions are continuous.
       normalizes: whether layers are normalised: Ball et al. (2023), section 4.2. False for the critics of a run that a
         release without it began.
     """
@@ -45,8 +48,10 @@ class TwinCritics(nn.Module):
         super().__init__()
         # Without layers of its own, an encoder of vectors puts all components side by side.
         self.encoder = build_encoder(spec.model_copy(update={"hidden": ()}), spaces.observations, modules)
-        actions = sum(space.size for space in spaces.actions.values())
-        sizes = [self.encoder.features + actions, *spec.hidden, 1]
+        choice = spaces.only_choice
+        self.choices = 0 if choice is None else choice.choices
+        actions = 0 if choice is not None else sum(space.size for space in spaces.actions.values())
+        sizes = [self.encoder.features + actions, *spec.hidden, self.choices or 1]
         pairs = list(itertools.pairwise(sizes))
         # As torch initialises linear layers; [2, inputs, outputs] and [2, 1, outputs].
         self.weights = nn.ParameterList([_uniform(inputs, (2, inputs, outputs)) for inputs, outputs in pairs])
@@ -60,7 +65,20 @@ class TwinCritics(nn.Module):
 
     def forward(self, prepared: Components, actions: Tensor) -> Tensor:
         """Return both values [2, B] of actions [B, D] in observations, each [B, *stacked_shape] or convolved."""
-        features = torch.cat([self.encoder(prepared).float(), actions], -1)
+        if self.choices:
+            return self.of_choices(prepared).gather(-1, actions.long().expand(2, *actions.shape)).squeeze(-1)
+        hidden, weight, bias = self._hidden(torch.cat([self.encoder(prepared).float(), actions], -1))
+        # In full precision, as the heads of ActorCritic. A product with a vector takes six times as long as this sum.
+        return (hidden.float() * weight.transpose(1, 2)).sum(-1) + bias.squeeze(-1)
+
+    def of_choices(self, prepared: Components) -> Tensor:
+        """Return both values of all A actions of a choice [2, B, A] in observations, which are as in `forward`."""
+        hidden, weight, bias = self._hidden(self.encoder(prepared).float())
+        with full_precision(hidden):
+            return torch.baddbmm(bias, hidden.float(), weight)
+
+    def _hidden(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the outputs [2, B, F'] of all layers but the last, of [B, F], and the weight and bias of that one."""
         hidden = features.expand(2, *features.shape)
         *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for inner_weight, inner_bias in layers:
@@ -68,8 +86,7 @@ class TwinCritics(nn.Module):
             if self.normalizes:
                 hidden = functional.layer_norm(hidden, hidden.shape[-1:])
             hidden = self._activate(hidden)
-        # In full precision, as the heads of ActorCritic. A product with a vector takes six times as long as this sum.
-        return (hidden.float() * weight.transpose(1, 2)).sum(-1) + bias.squeeze(-1)
+        return hidden, weight, bias
 
     def rounded(self) -> "TwinCritics":
         """Return a copy in bfloat16, but for the last layer, which both share."""
@@ -84,18 +101,19 @@ def _uniform(inputs: int, shape: tuple[int, ...]) -> nn.Parameter:
 
 
 _NORMALIZED = "layer_norm"
+ENTROPY_SHARE = 0.89  # of the largest entropy of a choice, log A: its target
 
 
 class Sac(Algorithm):
-    """Twin critics with target critics, a squashed Gaussian policy, and a temperature alpha that keeps its entropy.
+    """Twin critics with target critics, a policy, and a temperature alpha that keeps the entropy of the policy.
 
-    With a' ~ pi(s') and a transition of m rewards R and discounts d (replay_buffer.py), both critics regress on
+    The value of a policy is V(s) = E[min_i Q_i(s, a) - alpha log pi(a | s)], a ~ pi(s). With a transition of m rewards
+    R and discounts d (replay_buffer.py), both critics regress on R + d V-(s'), where V- has the target critics; the
+    policy ascends V(s); and log alpha descends log alpha (E[-log pi(a | s)] - H), where H is the target of the entropy.
+    All three gradients are those at the parameters before the update.
 
-        y = R + d (min_i Q-_i(s', a') - alpha log pi(a' | s'))
-
-    the policy descends E[alpha log pi(a | s) - min_i Q_i(s, a)], a ~ pi(s), and log alpha descends
-    -log alpha (log pi(a | s) + H), with the entropy H = -D of the actions scaled to [-1, 1] as the target. All three
-    gradients are those at the parameters before the update.
+    Continuous actions are squashed Gaussian: each expectation is one reparameterised sample, and H = -D, of the actions
+    scaled to [-1, 1]. For a choice of A actions an expectation is the sum over all of them, and H a share of log A.
     """
 
     record = ALGORITHMS["sac"]
@@ -123,7 +141,8 @@ class Sac(Algorithm):
         ]
         self.take_convolutions()
         self._log_temperature = torch.zeros(1, device=device)
-        self._actions = self.distribution.normal_count  # D
+        choices, count = critics.choices, self.distribution.normal_count  # A or 0, D or 0
+        self._target_entropy = ENTROPY_SHARE * math.log(choices) if choices else -float(count)
         self._target_rate, self._is_mixed = target_rate, is_mixed
         self._recorders = OperationRecorder(), OperationRecorder()
         self._records = device.type == "cpu" and not network.convolutional and not network.has_user_modules
@@ -165,7 +184,8 @@ class Sac(Algorithm):
     def gradients(self, transitions: Transitions) -> tuple[dict[str, Tensor], list[Tensor]]:
         """Return the gradients of one update, by the names in `learned` and "policy", and its loss terms (Terms)."""
         now, then, *others = transitions
-        noise = torch.randn((2 * len(transitions.rewards), self._actions), device=transitions.rewards.device)
+        shape = 2 * len(transitions.rewards), self.distribution.normal_count
+        noise = torch.randn(shape, device=transitions.rewards.device)
         noise, next_noise = noise.chunk(2)
         for values, rounded in self._rounded.items():
             rounded.data.copy_(values)
@@ -216,9 +236,9 @@ class Sac(Algorithm):
         """Return the gradient of the critics and their loss."""
         with self._precision():
             with torch.no_grad():
-                next_actions, next_log_probs = self._choose(self._critics.convolve(then), noise)
-                next_values = self._target_critics(self._target_critics.convolve(then), next_actions).amin(0)
-                targets = rewards + discounts * (next_values - self._log_temperature.exp() * next_log_probs)
+                by_targets = self._target_critics.convolve(then)
+                following, _ = self._values(self._target_critics, by_targets, self._critics.convolve(then), noise)
+                targets = rewards + discounts * following
             values = self._critics(now, actions)  # [2, B]
             value_loss = 0.5 * (values - targets).square().mean(-1).sum()
         return _differentiated(value_loss, self._critic_parameters), value_loss.detach()
@@ -226,20 +246,36 @@ class Sac(Algorithm):
     def _of_policy(self, now: Components, noise: Tensor) -> tuple[Tensor, ...]:
         """Return the gradients of the policy and of the temperature, the loss and the entropy of the policy."""
         with self._precision():
-            chosen, log_probs = self._choose(now, noise)
-            first, second = self._critics(now, chosen).unbind()
-            loss = (self._log_temperature.exp() * log_probs - torch.minimum(first, second)).mean()
+            values, entropies = self._values(self._critics, now, now, noise)
+            loss = -values.mean()
         gradient = _differentiated(loss, self._policy_parameters)
-        entropy = -log_probs.detach().mean()
-        return gradient, (entropy + self._actions).reshape(1), loss.detach(), entropy
+        entropy = entropies.detach().mean()
+        return gradient, (entropy - self._target_entropy).reshape(1), loss.detach(), entropy
 
-    def _choose(self, prepared: Components, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions of the policy [B, D] and their log-densities [B], made from noise [B, D]."""
+    def _values(
+        self, critics: TwinCritics, seen: Components, prepared: Components, noise: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the values V(s) by some critics, and the entropies of the policy, each [B].
+
+        Args:
+          critics: the critics or their targets.
+          seen: observations, with images convolved by `critics`.
+          prepared: the same, with images convolved for the policy.
+          noise: [B, D], of the samples of continuous actions.
+        """
         features = self._encoder(prepared).float()
-        device = features.device.type
-        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
-            parameters = self._network.policy_head(features)
-            return self.distribution.sample_and_log_prob(parameters, noise)
+        if critics.choices:
+            with full_precision(features):
+                log_probs = self._network.policy_head(features).log_softmax(-1)  # [B, A]: its outputs are the logits
+            first, second = critics.of_choices(seen).unbind()
+            expected = (log_probs.exp() * torch.minimum(first, second)).sum(-1)
+            entropies = -(log_probs.exp() * log_probs).sum(-1)
+        else:
+            with full_precision(features):
+                actions, log_probs = self.distribution.sample_and_log_prob(self._network.policy_head(features), noise)
+            first, second = critics(seen, actions).unbind()
+            expected, entropies = torch.minimum(first, second), -log_probs
+        return expected + self._log_temperature.exp() * entropies, entropies
 
     def _precision(self) -> AbstractContextManager[object]:
         device = self._log_temperature.device.type

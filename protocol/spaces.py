@@ -263,6 +263,19 @@ class Spaces(Specification):
             if isinstance(space, DiscreteSpace) and space.masked
         }
 
+    @property
+    def only_choice(self) -> DiscreteSpace | None:
+        """The action, if it is one discrete choice, masked or not; else None."""
+        first, *others = self.actions.values()
+        return first if isinstance(first, DiscreteSpace) and first.size == 1 and not others else None
+
+    @property
+    def fits_replay(self) -> bool:
+        """Whether `sac` can learn the actions: all are continuous with both bounds, or there is one unmasked choice."""
+        if self.only_choice is not None:
+            return not self.only_choice.masked
+        return all(isinstance(space, ContinuousSpace) and space.bounded for space in self.actions.values())
+
     def without_masks(self) -> "Spaces":
         """Return the same spaces whose choices are all legal."""
         actions = {

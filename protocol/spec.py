@@ -251,7 +251,7 @@ class LossSpec(Specification):
     algorithm: Annotated[str, Field(max_length=200), AfterValidator(check_algorithm)] = "impala"
     """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: PPO, asynchronous, in several passes;
     `one_step_q`, `one_step_sarsa` and `n_step_q`: action values, for one discrete action; `sac`: from a replay buffer,
-    for bounded continuous actions. Or `module:Class` for your own."""
+    for bounded continuous actions or one discrete action. Or `module:Class` for your own."""
     algorithm_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """Further arguments of the constructor of an algorithm of your own."""
     algorithm_record: AlgorithmRecord | None = None

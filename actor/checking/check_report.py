@@ -177,8 +177,7 @@ def uninformative_bounds(report: EnvironmentReport) -> str:
 
 def replay_instead(report: EnvironmentReport, spec: RunSpec) -> str:
     """Return advice to learn from each step many times, where steps are slow and sac can learn, or an empty string."""
-    actions = report.spaces.actions.values() if report.spaces is not None else ()
-    fits = bool(actions) and all(isinstance(space, ContinuousSpace) and space.bounded for space in actions)
+    fits = report.spaces is not None and report.spaces.fits_replay
     if report.step_seconds <= _DEAR_SECONDS or not fits or spec.algorithm.replay or spec.environment.is_game:
         return ""
     return (

@@ -38,7 +38,7 @@ class ActionDistribution(nn.Module):
             distributions: list[Distribution] = [Greedy(_only_choice(spaces, training.algorithm))]
         else:
             if training is not None and training.record.replay:
-                _check_bounded(spaces, training.algorithm)
+                _check_replay(spaces, training.algorithm)
             distributions = [_distribution(spec, name, space, modules) for name, space in spaces.actions.items()]
         self.components = nn.ModuleList(distributions)
         self._sizes = [component.parameter_count for component in self._distributions()]
@@ -116,9 +116,9 @@ def _sum(terms: list[Tensor]) -> Tensor:
 
 def _only_choice(spaces: Spaces, algorithm: str) -> DiscreteSpace:
     """Return the only action, which must be discrete. Raises NetworkError, which names the algorithm, if not."""
+    if spaces.only_choice is not None:
+        return spaces.only_choice
     only = next(iter(spaces.actions.values()))
-    if len(spaces.actions) == 1 and isinstance(only, DiscreteSpace) and only.size == 1:
-        return only
     table = ", or name discrete actions with environment.action_table" if isinstance(only, ContinuousSpace) else ""
     raise NetworkError(
         f"training.algorithm={algorithm} learns the value of each choice of one discrete action, but this environment "
@@ -126,12 +126,13 @@ def _only_choice(spaces: Spaces, algorithm: str) -> DiscreteSpace:
     )
 
 
-def _check_bounded(spaces: Spaces, algorithm: str) -> None:
-    """Raise NetworkError, which names the algorithm, unless all actions are continuous and have both bounds."""
-    if not all(isinstance(space, ContinuousSpace) and space.bounded for space in spaces.actions.values()):
+def _check_replay(spaces: Spaces, algorithm: str) -> None:
+    """Raise NetworkError, which names the algorithm, unless it can learn the actions."""
+    if not spaces.fits_replay:
         raise NetworkError(
-            f"training.algorithm={algorithm} needs continuous actions with bounds on both sides, but this environment "
-            f"has {spaces.listed_actions}: use appo, or let a wrapper (--wrap) bound the actions"
+            f"training.algorithm={algorithm} needs continuous actions with bounds on both sides, or one discrete "
+            f"action without masks, but this environment has {spaces.listed_actions}: use appo, or let a wrapper "
+            "(--wrap) change the actions"
         )
 
 

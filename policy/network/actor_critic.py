@@ -102,7 +102,7 @@ class ActorCritic(nn.Module):
         critic = remembered
         if self.value_encoder is not None:
             critic = self.value_encoder(flat).unflatten(0, starts.shape)
-        with _full_precision(remembered):
+        with full_precision(remembered):
             parameters = self.policy_head(remembered.float())
             if self.value_head is None:
                 return parameters, parameters.new_zeros(parameters.shape[:-1])
@@ -111,7 +111,7 @@ class ActorCritic(nn.Module):
     def policy(self, prepared: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the policies alone: as `unroll`, but with the state after the last row [B, S] in place of values."""
         remembered, state = self._remembered(_flattened(prepared), state, starts)
-        with _full_precision(remembered):
+        with full_precision(remembered):
             return self.policy_head(remembered.float()), state
 
     def _remembered(self, flat: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,7 +157,7 @@ def _flattened(prepared: Components) -> Components:
     return {name: values.flatten(0, 1) for name, values in prepared.items()}
 
 
-def _full_precision(features: Tensor) -> AbstractContextManager[object]:
+def full_precision(features: Tensor) -> AbstractContextManager[object]:
     """Return the context of the heads: bfloat16 would round values and logits to 8 bits, much of a TD error."""
     device = features.device.type
     return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()

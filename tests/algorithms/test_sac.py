@@ -13,7 +13,7 @@ from daedalus.algorithms.forward import FlatParameters
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.recording import EARLIER_CALLS
 from daedalus.algorithms.replay_buffer import Transitions
-from daedalus.algorithms.sac import Sac, TwinCritics
+from daedalus.algorithms.sac import ENTROPY_SHARE, Sac, TwinCritics
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.convolutional import ImageEncoder, ImageLayout
 from daedalus.policy.network.distributions import SquashedGaussian
@@ -35,18 +35,22 @@ def spaces_of(**actions: ActionSpace) -> Spaces:
 SPACES = spaces_of(arm=ARM, leg=LEG)
 
 
+CHOICE = spaces_of(choice=DiscreteSpace(counts=(4,)))
+
+
 class Built:
     """Sac, and the parts that the learner joins it with."""
 
-    def __init__(self, seed: int = 1, *, is_mixed: bool = False, **training: Any) -> None:
+    def __init__(self, seed: int = 1, *, spaces: Spaces = SPACES, is_mixed: bool = False, **training: Any) -> None:
         torch.manual_seed(seed)
+        self.spaces = spaces
         spec = TrainingSpec.model_validate({"algorithm": "sac", **training})
-        self.network = ActorCritic(POLICY, SPACES, training=spec)
+        self.network = ActorCritic(POLICY, spaces, training=spec)
         self.network.policy_head.weight.data.normal_(std=0.3)
-        computer = GradientComputer(spec, self.network, SPACES)
+        computer = GradientComputer(spec, self.network, spaces)
         assert isinstance(computer.algorithm, Sac)
         self.sac = computer.algorithm
-        self.critics = TwinCritics(POLICY, SPACES, NO_MODULES)
+        self.critics = TwinCritics(POLICY, spaces, NO_MODULES)
         self.sac.build(self.critics, self.network, target_rate=spec.target_rate, is_mixed=is_mixed)
         self.sac.statistics["target_critics"].add_(torch.randn_like(self.sac.statistics["target_critics"]) * 0.1)
         self.sac.learned["log_temperature"].fill_(math.log(0.3))
@@ -54,33 +58,34 @@ class Built:
     @property
     def targets(self) -> TwinCritics:
         """The target critics."""
-        critics = TwinCritics(POLICY, SPACES, NO_MODULES)
+        critics = TwinCritics(POLICY, self.spaces, NO_MODULES)
         values = FlatParameters(critics.parameters()).values
         values.copy_(self.sac.statistics["target_critics"])
         return critics
 
 
-def transitions(seed: int = 3) -> Transitions:
+def transitions(seed: int = 3, spaces: Spaces = SPACES) -> Transitions:
     torch.manual_seed(seed)
+    actions = torch.randint(4, (ROWS, 1)).float() if spaces is CHOICE else torch.rand(ROWS, 3) * 2.0 - 1.0
     return Transitions(
         observations={"o": torch.randn(ROWS, NUMBERS)},
         next_observations={"o": torch.randn(ROWS, NUMBERS)},
-        actions=torch.rand(ROWS, 3) * 2.0 - 1.0,
+        actions=actions,
         rewards=torch.randn(ROWS),
         discounts=torch.tensor([0.9, 0.0] * (ROWS // 2)),
     )
 
 
-def value(critics: TwinCritics, which: int, observation: Tensor, action: Tensor) -> Tensor:
-    """Q_which(s, a) of one observation and one action, layer by layer."""
-    inputs = torch.cat([observation, action])
+def value(critics: TwinCritics, which: int, *parts: Tensor) -> Tensor:
+    """The outputs of a critic of one observation, and of one action if it is continuous, layer by layer."""
+    inputs = torch.cat(parts)
     layers = list(zip(critics.weights, critics.biases, strict=True))
     for index, (weight, bias) in enumerate(layers):
         inputs = inputs @ weight[which] + bias[which, 0]
         if index < len(layers) - 1:
             inputs = inputs - inputs.mean()
             inputs = (inputs / (inputs.square().mean() + 1e-5).sqrt()).clamp(min=0.0)
-    return inputs[0]
+    return inputs if len(parts) == 1 else inputs[0]
 
 
 def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,6 +101,20 @@ def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Te
     )
     action = torch.tanh(mean + deviation * noise)
     return action, squashed.log_prob(action).sum()
+
+
+def check(built: Built, gradients: dict[str, Tensor], terms: list[Tensor], losses: list[Tensor], target: float) -> None:
+    """Compare gradients and terms with the losses of the critics and of the policy, and with the entropy."""
+    value_loss, policy_loss, entropy = losses
+    for name, loss, parameters in (
+        ("critics", value_loss, list(built.critics.parameters())),
+        ("policy", policy_loss, built.network.learned_parameters()),
+    ):
+        expected = torch.cat([each.flatten() for each in torch.autograd.grad(loss, parameters)])
+        torch.testing.assert_close(gradients[name], expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(gradients["log_temperature"], (entropy - target).reshape(1), rtol=1e-4, atol=1e-5)
+    for found, loss in zip(terms, (policy_loss, value_loss, entropy), strict=False):
+        torch.testing.assert_close(found, loss.detach(), rtol=1e-4, atol=1e-5)
 
 
 def test_gradients_are_those_of_the_papers_losses() -> None:
@@ -118,15 +137,56 @@ def test_gradients_are_those_of_the_papers_losses() -> None:
         smaller = torch.minimum(value(built.critics, 0, now, action), value(built.critics, 1, now, action))
         policy_loss = policy_loss + (alpha * log_prob - smaller) / ROWS
         entropy = entropy - log_prob.detach() / ROWS
-    for name, loss, parameters in (
-        ("critics", value_loss, list(built.critics.parameters())),
-        ("policy", policy_loss, built.network.learned_parameters()),
-    ):
-        expected = torch.cat([each.flatten() for each in torch.autograd.grad(loss, parameters)])
-        torch.testing.assert_close(gradients[name], expected, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(gradients["log_temperature"], (entropy + 3.0).reshape(1), rtol=1e-4, atol=1e-5)
-    for found, loss in zip(terms, (policy_loss, value_loss, entropy), strict=False):
-        torch.testing.assert_close(found, loss.detach(), rtol=1e-4, atol=1e-5)
+    check(built, gradients, terms, [value_loss, policy_loss, entropy], -3.0)
+
+
+def test_gradients_of_a_choice_are_those_of_the_papers_losses() -> None:
+    """Christodoulou (2019), equations 4, 10 and 12: each expectation over the actions is a sum."""
+    built, batch = Built(spaces=CHOICE), transitions(spaces=CHOICE)
+    gradients, terms = built.sac.gradients(batch)
+    alpha, targets = 0.3, built.targets
+    value_loss, policy_loss, entropy = torch.zeros(()), torch.zeros(()), torch.zeros(())
+    for row in range(ROWS):
+        now, then = batch.observations["o"][row], batch.next_observations["o"][row]
+        of_now, of_then = (
+            built.network.policy_head(built.network.encoder({"o": each[None]}))[0] for each in (now, then)
+        )
+        y = batch.rewards[row]
+        for action in range(4):
+            probability = (of_then[action] - of_then.logsumexp(0)).exp().detach()
+            smaller = min(value(targets, which, then)[action].detach() for which in range(2))
+            y = y + batch.discounts[row] * probability * (smaller - alpha * probability.log())
+            log_prob = of_now[action] - of_now.logsumexp(0)
+            smaller = min(value(built.critics, which, now)[action].detach() for which in range(2))
+            policy_loss = policy_loss + log_prob.exp() * (alpha * log_prob - smaller) / ROWS
+            entropy = entropy - (log_prob.exp() * log_prob).detach() / ROWS
+        for which in range(2):
+            played = value(built.critics, which, now)[int(batch.actions[row, 0])]
+            value_loss = value_loss + 0.5 * (played - y) ** 2 / ROWS
+    check(built, gradients, terms, [value_loss, policy_loss, entropy], ENTROPY_SHARE * math.log(4.0))
+
+
+def test_target_of_a_choice_by_hand() -> None:
+    """Uniform policy of four actions, Q- = (1, 2, 3, 4) and 2.5: y = r + d (mean of (1, 2, 2.5, 2.5) + alpha log 4)."""
+    built = Built(spaces=CHOICE)
+    for parameter in built.network.parameters():
+        parameter.data.zero_()
+    for which in (built.sac.statistics["target_critics"], built.sac.learned["critics"]):
+        which.zero_()
+    built.sac.statistics["target_critics"][-8:] = torch.tensor([1.0, 2.0, 3.0, 4.0] + [2.5] * 4)  # the last biases
+    batch = transitions(spaces=CHOICE)._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
+    _, (_, value_loss, entropy, _) = built.sac.gradients(batch)
+    assert float(value_loss) == pytest.approx((0.5 + 0.9 * (2.0 + 0.3 * math.log(4.0))) ** 2, rel=1e-5)
+    assert float(entropy) == pytest.approx(math.log(4.0))
+
+
+@pytest.mark.parametrize(("logit", "rises"), [(0.0, False), (9.0, True)])
+def test_temperature_of_a_choice_rises_where_the_policy_is_nearly_certain(logit: float, rises: bool) -> None:
+    built = Built(spaces=CHOICE)
+    built.network.policy_head.weight.data.zero_()
+    built.network.policy_head.bias.data[0] = logit
+    gradients, _ = built.sac.gradients(transitions(spaces=CHOICE))
+    assert (float(gradients["log_temperature"]) < 0.0) is rises  # the optimiser descends
 
 
 def test_target_by_hand() -> None:
@@ -150,22 +210,24 @@ def test_target_by_hand() -> None:
     assert float(value_loss) == pytest.approx(float((0.5 * ((1.0 - y) ** 2 + (4.0 - y) ** 2)).mean()), rel=1e-4)
 
 
-def test_recorded_updates_have_the_gradients_of_the_others() -> None:
-    built = Built()
+@pytest.mark.parametrize("spaces", [SPACES, CHOICE])
+def test_recorded_updates_have_the_gradients_of_the_others(spaces: Spaces) -> None:
+    built = Built(spaces=spaces)
     for _ in range(EARLIER_CALLS + 1):
-        built.sac.gradients(transitions(8))
-    batch = transitions(8)
+        built.sac.gradients(transitions(8, spaces))
+    batch = transitions(9, spaces)
     torch.manual_seed(7)
     found, _ = built.sac.gradients(batch)
-    other = Built()
+    other = Built(spaces=spaces)
     torch.manual_seed(7)
     expected, _ = other.sac.gradients(batch)
     for name, gradient in found.items():
         torch.testing.assert_close(gradient, expected[name])
 
 
-def test_bfloat16_rounds_the_parameters_of_the_moment() -> None:
-    exact, rounded = Built(), Built(is_mixed=True)
+@pytest.mark.parametrize("spaces", [SPACES, CHOICE])
+def test_bfloat16_rounds_the_parameters_of_the_moment(spaces: Spaces) -> None:
+    exact, rounded = Built(spaces=spaces), Built(spaces=spaces, is_mixed=True)
     for built in (exact, rounded):  # after the copies were made
         torch.manual_seed(11)
         for values in (built.sac.statistics["critics"], built.sac.statistics["target_critics"]):
@@ -176,7 +238,7 @@ def test_bfloat16_rounds_the_parameters_of_the_moment() -> None:
         found = []
         for built in (exact, rounded):
             torch.manual_seed(5)
-            found.append(built.sac.gradients(transitions())[0])
+            found.append(built.sac.gradients(transitions(spaces=spaces))[0])
         for name, expected in found[0].items():
             assert found[1][name].dtype == torch.float32
             assert 0.0 < float((found[1][name] - expected).norm() / expected.norm()) < 0.05, name
@@ -205,7 +267,9 @@ def test_sampled_density_is_that_of_torch_also_beyond_the_last_digit(mean: float
 @pytest.mark.parametrize(
     ("actions", "named"),
     [
-        ({"a": DiscreteSpace(counts=(4,))}, "4 choices"),
+        ({"a": DiscreteSpace(counts=(4,), masked=True)}, "4 choices, masked"),
+        ({"a": DiscreteSpace(counts=(2, 3))}, "choices of 2 x 3"),
+        ({"a": DiscreteSpace(counts=(4,)), "b": DiscreteSpace(counts=(2,))}, "a: 4 choices, b: 2 choices"),
         ({"arm": ARM, "hand": DiscreteSpace(counts=(2,))}, "hand"),
         ({"a": ContinuousSpace(low=(None,), high=(1.0,))}, "-inf"),
     ],
@@ -220,8 +284,9 @@ def test_other_actions_are_refused_in_one_line(actions: dict[str, ActionSpace], 
 PIXELS = ArraySpace(shape=(42, 42), dtype="uint8", frames=2)
 
 
-def test_convolutions_are_those_of_the_critics() -> None:
-    spaces = Spaces(observations={"pixels": PIXELS}, actions={"leg": LEG})
+@pytest.mark.parametrize("action", [LEG, DiscreteSpace(counts=(3,))])
+def test_convolutions_are_those_of_the_critics(action: ActionSpace) -> None:
+    spaces = Spaces(observations={"pixels": PIXELS}, actions={"a": action})
     spec = TrainingSpec(algorithm="sac")
     network = ActorCritic(POLICY, spaces, training=spec)
     computer, critics = GradientComputer(spec, network, spaces), TwinCritics(POLICY, spaces, NO_MODULES)

@@ -18,7 +18,8 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training import replay_files
 from daedalus.learner.training.replay_files import FOLDER, ReplayFiles
 from daedalus.learner.training.replay_learner import ReplayLearner
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout
 
@@ -109,6 +110,36 @@ def test_half_of_each_minibatch_is_demonstrations(monkeypatch: pytest.MonkeyPatc
     trained(learner, 2, 3, 4)
     assert len(sampled) == 16
     assert all(len(rewards) == 8 and (rewards == 77.0).sum() == 4 for rewards in sampled)
+
+
+def test_a_choice_is_learned_from_rollouts_people_and_demonstrations() -> None:
+    """The policy has played 0, people 1, and demonstrations show 2, which earns most. A resumed run knows it, too."""
+    spaces = SPACES.model_copy(update={"actions": {"action": DiscreteSpace(counts=(3,))}})
+    spec = spec_of(discount_factor=0.0, learning_rate=0.02, max_gradient_norm=100.0)
+
+    def playing(action: int, seed: int) -> Rollout:
+        played = np.full((ROWS, ENVIRONMENTS, 1), action, np.uint8)
+        return replace(rollout(seed), actions={"action": played}, rewards=played[..., 0].astype(np.float32))
+
+    learner = ReplayLearner(spec, spaces)
+    shown = ReplayBuffer(spaces, ROWS, 32)
+    for seed in range(4):
+        shown.add(playing(2, seed))
+    learner.learn_from(shown)
+    for seed in range(12):
+        by_people = playing(1, 100 + seed)
+        for each in (replace(by_people, overridden=by_people.valid, taught=by_people.valid), playing(0, 200 + seed)):
+            learner.step([each], 0.0)
+            while learner.updates_due:
+                learner.step([], 0.0)
+    other = ReplayLearner(spec, spaces)
+    other.restore(learner.policy_version, learner.weights(), {k: v.clone() for k, v in learner.state().items()})
+    network = ActorCritic(spec.policy, spaces, training=spec.training)
+    network.load_state_dict({name: torch.from_numpy(values) for name, values in other.weights().items()})
+    logits, _ = network.step({"observation": torch.randn(20, 3)}, torch.zeros(20, 0))
+    assert (logits[:, 0] < logits[:, 1]).all()
+    assert (logits[:, 1] < logits[:, 2]).all()
+    assert other.entropy_bonus(0.0) == learner.entropy_bonus(0.0) != 1.0
 
 
 def test_people_teach_also_in_rollouts_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
