@@ -176,8 +176,11 @@ def uninformative_bounds(report: EnvironmentReport) -> str:
 
 
 def replay_instead(report: EnvironmentReport, spec: RunSpec) -> str:
-    """Return advice to learn from each step many times, where steps are slow and sac can learn, or an empty string."""
-    fits = report.spaces is not None and report.spaces.fits_replay
+    """Return advice to learn from each step many times, where steps are slow and sac can learn, or an empty string.
+
+    Not for a choice, where sac has not been better for the same number of steps (docs/results.md).
+    """
+    fits = report.spaces is not None and report.spaces.fits_replay and report.spaces.only_choice is None
     if report.step_seconds <= _DEAR_SECONDS or not fits or spec.algorithm.replay or spec.environment.is_game:
         return ""
     return (
