@@ -1,6 +1,5 @@
 """What every process does: stop on signals, end with its parent, and end when one of its threads fails."""
 
-import atexit
 import contextlib
 import errno
 import gc
@@ -22,9 +21,6 @@ from daedalus.transport.credentials import NotValidNowError
 from daedalus.transport.slow_calls import in_progress
 
 _logger = logging.getLogger(__name__)
-
-# At its end the interpreter would look for cycles among the objects of all modules: a fifth of a short command's time.
-atexit.register(gc.freeze)
 
 # Exit statuses of every command; docs/operations.md has the table of all. A supervisor starts a process that failed
 # again, and not one that was started wrongly: that fails each time.
@@ -249,6 +245,7 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     `outputs` are the streams that the command writes to, besides standard output and standard error.
     """
     open_standard_streams()
+    gc.freeze()  # what has been imported: the interpreter would look through it again, also at its end
     before = set(threading.enumerate())
     try:
         try:

@@ -4,7 +4,9 @@ This is the main thread; the other threads are those of the actor server and the
 actors can join, because the import takes a second and the actors make their environments in the meantime.
 """
 
+import gc
 import logging
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -106,9 +108,12 @@ class LearnerService:
             continue_records(self._context)
             if league is not None:
                 league.open(self._context.start_version)
+            is_first = "torch" not in sys.modules
             from daedalus.learner.training.learner import Learner
             from daedalus.learner.training.replay_learner import ReplayLearner
 
+            if is_first:  # the collector would look through all of torch, also at the end: a fifth of a short run
+                gc.freeze()
             if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):
                 return self._stopped_early("before the first actor joined")
             spaces = self._context.fleet.spaces
