@@ -19,18 +19,16 @@ LAST = ("--set", "evaluation.final_episodes=1", "--set", "service.checkpoint_sec
 
 
 def test_a_sweep_that_is_stopped_continues(tmp_path: Path) -> None:
-    words = ("sweep", "cartpole", "--over", "collection.rollout_length=8,16", "--seeds", 1, "--jobs", 2)
+    words = ("sweep", "cartpole", "--over", "collection.rollout_length=8", "--seeds", 1)
     with starting(tmp_path) as start:
         first = start(*words, *SETTINGS, *LAST)
         folder = tmp_path / "sweeps" / "cartpole-rollout_length"
         until(lambda: list(folder.glob("*/config.toml")) or first.process.poll() is not None)
         first.process.send_signal(signal.SIGTERM)
         assert first.wait() == 1, first.output
-        assert "of 2 runs have ended; continue with: daedalus sweep cartpole --over collection" in first.lines[-1]
-        for name in ("rollout_length-8_seed-1", "rollout_length-16_seed-1"):
-            until(lambda name=name: not processes_mentioning(name))
+        assert "of 1 runs have ended; continue with: daedalus sweep cartpole --over collection" in first.lines[-1]
+        until(lambda: not processes_mentioning("rollout_length-8_seed-1"))
         second = start(*words, *SETTINGS, *LAST)
         assert second.wait() == 0, second.output
         assert any(line.endswith(": continues") for line in second.lines), second.output
         assert second.expect(r"^rollout_length=8 +1 +\d")
-        assert second.expect(r"^rollout_length=16 +1 +\d")
