@@ -8,10 +8,10 @@ PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
-# Six processes share the tests, also on two cores: many tests wait for the processes that they start, and their files come
+# Four processes share the tests, also on two cores: many tests wait for the processes that they start, and their files come
 # first. The tests of one file run in one process, because they share what they start.
 test: check
-	$(BIN)/pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 
 # The mathematics, the wire, the learner and runs with real processes, in an environment of their own. With the oldest
 # releases that pyproject.toml allows:

@@ -23,7 +23,7 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
-settings.register_profile("daedalus", deadline=None)
+settings.register_profile("daedalus", deadline=None, max_examples=50)  # `make fuzz` tries many more
 settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
 settings.load_profile("daedalus")
 

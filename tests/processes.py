@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-# The same without the report at the end of a training, as on a machine without matplotlib, whose import takes a tenth of
+# The same without the report at the end of a training, as on a machine without matplotlib: its import takes a tenth of
 # the time of a short one.
 NO_REPORT = [*DAEDALUS[:-1], f"import sys; sys.modules['matplotlib'] = None; {DAEDALUS[-1]}"]
 LIMIT = 300.0  # seconds; timeout of each step, long enough for a slow machine with much other work

@@ -67,30 +67,9 @@ def test_an_unknown_name_is_refused() -> None:
 # ------------------------------------------------------------------------------------------------ train
 
 
-def test_train_returns_the_result_in_another_thread(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    results: list[daedalus.RunResult] = []
-    directory = tmp_path / "from-a-thread"
-    arguments = {**BUDGET, "run_dir": str(directory), "quiet": True, "seed": 3}
-    thread = threading.Thread(target=lambda: results.append(daedalus.train("cartpole", **arguments)))
-    thread.start()
-    thread.join()
-    (result,) = results
-    summary = json.loads((directory / "summary.json").read_text())
-    assert (result.directory, result.exit_status) == (directory, 3)  # the budget was used up before the target
-    assert (result.solved, result.finished) == (False, True)
-    assert result.env_steps == summary["env_steps"] >= 5_000
-    assert result.evaluation_return_mean == summary["evaluation_return_mean"] > 0
-    assert result.summary == summary
-    assert (summary["seed"], summary["algorithm"]) == (3, "impala")
-    assert capfd.readouterr() == ("", "")
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
-    assert not processes_mentioning("from-a-thread")
-    policy = daedalus.load_policy(directory)
-    assert policy.policy_version == result.updates
-
-
-def test_a_callback_logs_metrics_and_ends_training(tmp_path: Path) -> None:
+def test_train_in_another_thread_calls_its_callback_and_returns_the_result(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     class Watch(daedalus.Callback):
         calls: ClassVar[list[str]] = []
 
@@ -106,14 +85,31 @@ def test_a_callback_logs_metrics_and_ends_training(tmp_path: Path) -> None:
         def on_end(self, run: daedalus.TrainingRun) -> None:
             self.calls.append("end")
 
-    settings = {"evaluation.final_episodes": 1, "service.log_seconds": 0.1}
-    arguments = {"env_steps": 10**9, "actors": 1, "run_dir": tmp_path / "run", "quiet": True, "settings": settings}
-    result = daedalus.train(env="CartPole-v1", **arguments, callback=Watch())
-    assert (result.stop_reason, result.finished, result.exit_status) == ("it came back", False, 0)
-    assert result.evaluation_return_mean > 0
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    results: list[daedalus.RunResult] = []
+    directory = tmp_path / "from-a-thread"
+    settings = {**BUDGET["settings"], "service.log_seconds": 0.1}
+    arguments = {"env_steps": 10**9, "actors": 1, "run_dir": str(directory), "quiet": True, "settings": settings}
+    arguments |= {"seed": 3, "callback": Watch()}
+    thread = threading.Thread(target=lambda: results.append(daedalus.train(env="CartPole-v1", **arguments)))
+    thread.start()
+    thread.join()
+    (result,) = results
+    summary = json.loads((directory / "summary.json").read_text())
+    assert (result.directory, result.exit_status, result.stop_reason) == (directory, 0, "it came back")
+    assert (result.solved, result.finished) == (False, False)
+    assert result.env_steps == summary["env_steps"] > 0
+    assert result.evaluation_return_mean == summary["evaluation_return_mean"] > 0
+    assert result.summary == summary
+    assert (summary["seed"], summary["algorithm"]) == (3, "appo")
+    assert capfd.readouterr() == ("", "")
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
+    assert not processes_mentioning("from-a-thread")
+    policy = daedalus.load_policy(directory)
+    assert policy.policy_version == result.updates
     assert (Watch.calls[0], Watch.calls[-1]) == ("start", "end")
     assert set(Watch.calls[1:-1]) == {"row"}
-    assert "user/twice" in (tmp_path / "run" / "metrics.csv").read_text().splitlines()[0]
+    assert "user/twice" in (directory / "metrics.csv").read_text().splitlines()[0]
 
 
 def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:

@@ -128,10 +128,12 @@ def test_the_sdist_holds_the_same_package_and_its_build_files(sdist: Path) -> No
 
 
 def test_train_works_beside_packages_and_scripts_of_the_same_names(environment: Path, scripts: Path) -> None:
-    settings = ("--env-steps", "4000", "--set", "training.target_return=none", "--set", "evaluation.final_episodes=1")
-    output = run(environment / "daedalus", "train", "cartpole", *settings, "--run-dir", "run", folder=scripts)
+    settings = ("--env-steps", "500", "--set", "training.target_return=none", "--set", "evaluation.final_episodes=1")
+    name = "r\u00e9 \u202e$x"  # of a directory
+    output = run(
+        environment / "daedalus", "train", "cartpole", "--actors", "1", *settings, "--run-dir", name, folder=scripts
+    )
     assert "evaluation: return" in output
-    assert run(environment / "daedalus", "evaluate", "run", "--episodes", "2", folder=scripts)
 
 
 def test_uvx_runs_the_distribution_by_its_name(uv: Callable[..., subprocess.CompletedProcess[str]]) -> None:

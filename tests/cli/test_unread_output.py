@@ -79,12 +79,7 @@ def test_a_command_prints_any_path_in_characters_that_its_output_has(tmp_path: P
         assert all(line.isprintable() for line in text.split("\n")), text
         return ended.returncode, text
 
-    if encoding == "ascii":
-        budget = ("--actors", "1", "--env-steps", "500", "--set", "evaluation.final_episodes=1", "--log-json")
-        status, text = run("train", "--env", "CartPole-v1", *budget, "--run-dir", NAME)
-        assert (status, "finished" in text) == (0, True), text
-    else:
-        record(tmp_path / NAME)
+    record(tmp_path / NAME)
     status, text = run("report", NAME)
     assert (status, text.strip()) == (
         0,
