@@ -109,11 +109,14 @@ class LearnerService:
             if league is not None:
                 league.open(self._context.start_version)
             is_first = "torch" not in sys.modules
+            if is_first:  # the collector would look through all of torch, again and again, also at the end
+                gc.disable()
             from daedalus.learner.training.learner import Learner
             from daedalus.learner.training.replay_learner import ReplayLearner
 
-            if is_first:  # the collector would look through all of torch, also at the end: a fifth of a short run
+            if is_first:
                 gc.freeze()
+                gc.enable()
             if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):
                 return self._stopped_early("before the first actor joined")
             spaces = self._context.fleet.spaces

@@ -86,7 +86,6 @@ def test_mistakes_with_certificates_are_reported_in_one_line(
             "cannot be resolved to an address",
         ),
         (("learner", "cartpole", "--listen", "tcp/0.0.0.0:1"), 2, "is unencrypted and open to every host"),
-        (("train", "cartpole", "--listen", "tcp/0.0.0.0:1"), 2, "is unencrypted and open to every host"),
         (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner is required"),
     ):
         failed = start(*arguments)
