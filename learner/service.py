@@ -108,13 +108,13 @@ class LearnerService:
             continue_records(self._context)
             if league is not None:
                 league.open(self._context.start_version)
-            is_first = "torch" not in sys.modules
-            if is_first:  # the collector would look through all of torch, again and again, also at the end
+            pauses = "torch" not in sys.modules and gc.isenabled()
+            if pauses:  # the collector would look through all of torch, again and again, also at the end
                 gc.disable()
             from daedalus.learner.training.learner import Learner
             from daedalus.learner.training.replay_learner import ReplayLearner
 
-            if is_first:
+            if pauses:
                 gc.freeze()
                 gc.enable()
             if self._context.fleet.spaces is None and not self._server.await_actor(self._heartbeat.beat):

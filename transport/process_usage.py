@@ -8,14 +8,14 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-_CONTROL_GROUP = Path("/sys/fs/cgroup")  # that of this process, as a container sees it
+CONTROL_GROUP = Path("/sys/fs/cgroup")  # that of this process, as a container sees it
 
 
 def available_processors() -> int:
     """Return how many processors this process may use: those it may run on, and no more than its container has."""
     found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
-        quota, period = (int(word) for word in (_CONTROL_GROUP / "cpu.max").read_text("ascii").split())
+        quota, period = (int(word) for word in (CONTROL_GROUP / "cpu.max").read_text("ascii").split())
         found = min(found, math.ceil(quota / period))  # in microseconds; the quota may be "max"
     except (OSError, ValueError, ZeroDivisionError):
         pass
@@ -32,7 +32,7 @@ def available_memory() -> int | None:
         pass
     try:
         names = ("memory.max", "memory.current", "memory.stat")
-        limit, used, statistics = ((_CONTROL_GROUP / name).read_text("ascii") for name in names)
+        limit, used, statistics = ((CONTROL_GROUP / name).read_text("ascii") for name in names)
         files = re.search(r"^inactive_file (\d+)$", statistics, re.MULTILINE)  # read before, and given up when needed
         found.append(max(int(limit) - int(used) + (int(files[1]) if files else 0), 0))  # the limit may be "max"
     except (OSError, ValueError):

@@ -13,7 +13,7 @@ from daedalus.transport.process_usage import available_memory, available_process
 @pytest.fixture
 def container(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a container's limits. The machine has 64 processors."""
-    monkeypatch.setattr(process_usage, "_CONTROL_GROUP", tmp_path)
+    monkeypatch.setattr(process_usage, "CONTROL_GROUP", tmp_path)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {*range(64)}, raising=False)
     return tmp_path
 
