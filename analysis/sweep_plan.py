@@ -150,6 +150,8 @@ class Planner:
             own = f"{name}_seed-{seed}" if name else f"seed-{seed}"
             directory = self._folder / own
             spec = choice.spec(self._defaults)
+            if spec.evaluation.final_episodes == 0:
+                raise SettingsError("evaluation.final_episodes: at least 1, as a sweep compares final evaluations")
             words = (*_words(choice, self._trackers), "--run-dir", str(directory))
             run = PlannedRun(name=own, point=point, seed=seed, directory=directory, spec=spec, words=words)
             _check_same(run)

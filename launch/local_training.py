@@ -285,7 +285,8 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
-    A process offers the policies, and evaluators play: for several candidates several at a time.
+    A process offers the policies, and evaluators play: for several candidates several at a time. A run without final
+    episodes keeps the summary of its training.
 
     Args:
       run: which has been trained.
@@ -297,6 +298,8 @@ def evaluate_run(
     """
     if not (run.directory / run_directory.SUMMARY).exists():  # the learner has said why
         raise UnsavedError(f"the summary of the run could not be saved: {_remedy(run)}")
+    if run.spec.evaluation.final_episodes == 0:
+        return run_directory.read_json(run.directory / run_directory.SUMMARY)
     most = min(len(candidates(run.directory)) or 1, available_processors())
     opponents = _final_opponents(run)
     names = [] if opponents else [f"evaluation-{number}" for number in range(most)]

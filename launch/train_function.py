@@ -56,8 +56,8 @@ class RunResult:
     updates: int
     episodes: int
     episode_return_mean: float | None  # mean of the newest training episodes; None if none has ended
-    evaluation_return_mean: float  # over evaluation.final_episodes episodes of the best policy
-    evaluation_return_std: float
+    evaluation_return_mean: float | None  # over evaluation.final_episodes episodes of the best policy; None without any
+    evaluation_return_std: float | None
     confirmation_return_mean: float | None  # over new sampled episodes; None unless training stopped at the target
     wall_seconds: float  # training, without the final evaluation
     seconds_to_target: float | None

@@ -450,8 +450,9 @@ class EvaluatorSpec(Specification):
 class EvaluationSpec(EvaluatorSpec):
     """Evaluator that `daedalus train` runs beside the actors, on episodes that training never uses."""
 
-    final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100
-    """Episodes of the evaluation of the best policy after training."""
+    final_episodes: Annotated[int, Field(ge=0, le=10_000)] = 100
+    """Episodes of the evaluation of the best policy after training. 0: none, and the best policy is the one that was
+    best in training; for simulators and robots where they would take too long."""
     final_backend: Backend | None = None
     """Backend of the final evaluation. Unset: `environment.backend`."""
 

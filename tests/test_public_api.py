@@ -34,7 +34,7 @@ from daedalus.policy.saving.saved_policy import find_policy, pretrained
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
-BUDGET = {"env_steps": 5_000, "actors": 1, "settings": {"evaluation.final_episodes": 1, "policy.hidden": [16]}}
+BUDGET = {"env_steps": 5_000, "actors": 1, "settings": {"evaluation.final_episodes": 0, "policy.hidden": [16]}}
 
 
 def test_importing_daedalus_loads_no_other_package() -> None:
@@ -99,7 +99,7 @@ def test_train_in_another_thread_calls_its_callback_and_returns_the_result(
     assert (result.directory, result.exit_status, result.stop_reason) == (directory, 0, "it came back")
     assert (result.solved, result.finished) == (False, False)
     assert result.env_steps == summary["env_steps"] > 0
-    assert result.evaluation_return_mean == summary["evaluation_return_mean"] > 0
+    assert (result.evaluation_return_mean, summary["evaluation_return_mean"]) == (None, None)
     assert result.summary == summary
     assert (summary["seed"], summary["algorithm"]) == (3, "appo")
     assert capfd.readouterr() == ("", "")
@@ -316,6 +316,7 @@ def test_the_code_of_the_user_may_change_the_working_directory(tmp_path: Path, m
 
     callback = Restless()
     settings = {**BUDGET["settings"], "policy.encoder": "leaving:Net", "service.log_seconds": 0.05}
+    settings["evaluation.final_episodes"] = 1
     result = daedalus.train(
         env="leaving:Leaving-v0", run_dir="run", callback=callback, settings=settings, env_steps=600, actors=1
     )

@@ -375,7 +375,7 @@ def left_report(directory: Path) -> str:
 
 
 def report(run: LocalRun, summary: dict[str, Any]) -> str:
-    """Return the result of a run from its summary.json, with the evaluation."""
+    """Return the result of a run from its summary.json, with the evaluation if it has one."""
     target = run.spec.target
     skipped = f" ({summary['updates_skipped']:,} skipped)" if summary.get("updates_skipped") else ""
     updates = f"{summary['updates']:,} updates{skipped}"
@@ -387,7 +387,11 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
     else:
         goal = f" (the target, {target}, was not reached)" if target else ""
         trained = f"done: {summary['env_steps']:,} env_steps, {updates}{goal}"
-    evaluation = summary["evaluation"]
+    lines = [trained, *_rated(summary), *_confirmed(run, summary)]
+    evaluation = summary.get("evaluation")
+    if evaluation is None:
+        folder = shlex.quote(str(run.directory))
+        return "\n".join([*lines, f"not evaluated (evaluation.final_episodes=0): daedalus evaluate {folder}"])
     evaluated = (
         f"evaluation: return {short_number(evaluation['return_mean'])} +- {short_number(evaluation['return_std'])} "
         f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
@@ -396,7 +400,7 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
     )
     if "matches" in evaluation:
         evaluated = f"evaluation of the newest checkpoint, {evaluation['actions']} actions: {evaluation['summary']}"
-    return "\n".join([trained, *_rated(summary), *_confirmed(run, summary), evaluated, *evaluation["notes"]])
+    return "\n".join([*lines, evaluated, *evaluation["notes"]])
 
 
 def _rated(summary: dict[str, Any]) -> list[str]:

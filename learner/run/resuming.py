@@ -236,7 +236,8 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
     else:
         return None
     missed = bool(spec.target) and training.stop_when_solved and not solved
-    to_evaluate = bool(summary.get("finished")) and summary.get("evaluation") is None
+    evaluated = summary.get("evaluation") is not None or spec.evaluation.final_episodes == 0
+    to_evaluate = bool(summary.get("finished")) and not evaluated
     return FinishedRun(reason=reason, missed=missed, to_evaluate=to_evaluate)
 
 

@@ -135,6 +135,8 @@ def test_settings_that_are_not_valid_are_refused_before_any_run(tmp_path: Path) 
         planner(tmp_path).runs("n", {"collection.rollout_length": "-1"}, [1])
     with pytest.raises(SettingsError, match=r"did you mean collection\.rollout_length\?"):
         planner(tmp_path).runs("n", {"collection.rolout_length": "5"}, [1])
+    with pytest.raises(SettingsError, match=r"evaluation\.final_episodes: at least 1"):
+        planner(tmp_path).runs("n", {"evaluation.final_episodes": "0"}, [1])
 
 
 @pytest.mark.parametrize(

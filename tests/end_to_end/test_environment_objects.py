@@ -44,7 +44,7 @@ import sys
 
 import daedalus
 
-SETTINGS = {"evaluation.final_episodes": 1, "policy.hidden": [16], "service.log_seconds": 0.2}
+SETTINGS = {"evaluation.final_episodes": 0, "policy.hidden": [16], "service.log_seconds": 0.2}
 FEW = {"actors": 2, "settings": {**SETTINGS, "collection.rollout_length": 16}, "quiet": True}
 
 
@@ -131,7 +131,8 @@ def test_an_instance_has_one_actor_and_stays_as_it_was(tmp_path: Path) -> None:
     if __name__ == "__main__":
         instance = Parity()
         found = {"several": refused(daedalus.train, env=instance, **FEW)}
-        result = daedalus.train(env=instance, run_dir="run", env_steps=600, settings=SETTINGS, quiet=True)
+        evaluated = {**SETTINGS, "evaluation.final_episodes": 1}
+        result = daedalus.train(env=instance, run_dir="run", env_steps=600, settings=evaluated, quiet=True)
         found |= {"result": seen(result)}
         found |= {"played": instance.steps, "spec": instance.spec is None}
         found["evaluated"] = daedalus.evaluate("run", env=instance, episodes=3).return_mean

@@ -116,7 +116,7 @@ def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, alg
 
 SETTINGS = ("training.env_steps=12000", "training.stop_when_solved=false")
 NORMALIZATION = (
-    "evaluation.final_episodes=1",
+    "evaluation.final_episodes=0",
     "policy.normalize_observations=true",
     "training.normalize_rewards=true",
     "training.normalize_advantages=true",

@@ -53,7 +53,7 @@ def test_a_run_of_an_earlier_version_can_be_evaluated_and_continued(tmp_path: Pa
 
 def test_a_run_of_an_earlier_version_is_resumed(start: Callable[..., Running], tmp_path: Path) -> None:
     run = restored(FIRST_OF_FORMAT_2, tmp_path)
-    resumed = start("resume", run, "--env-steps", 4000, "--set", "evaluation.final_episodes=1")
+    resumed = start("resume", run, "--env-steps", 4000, "--set", "evaluation.final_episodes=0")
     assert resumed.wait() == 3, resumed.output  # the budget
     resumed.expect("done: 4,0.. env_steps")
     assert (run / CONFIG).read_text().startswith(f"# written by {own_release()}\n")

@@ -18,7 +18,7 @@ from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
 SIZES = ("collection.actors=1", "collection.envs_per_actor=2", "collection.rollout_length=8", "training.minibatches=1")
-TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=1")
+TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=0")
 WORDS = [word for each in (*SIZES, *TARGET) for word in ("--set", each)]
 
 
@@ -26,7 +26,7 @@ WORDS = [word for each in (*SIZES, *TARGET) for word in ("--set", each)]
 def train(start: Start, tmp_path: Path) -> Callable[..., Running]:
     """Function that trains in an environment whose evaluations are as bad as files in `tmp_path` say."""
     shutil.copy(Path(__file__).parent.parent / "lucky_environment.py", tmp_path)
-    return lambda: start("train", "--env", "lucky_environment:Lucky-v0", "--run-dir", "run", *WORDS)
+    return lambda *more: start("train", "--env", "lucky_environment:Lucky-v0", "--run-dir", "run", *WORDS, *more)
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def test_a_learner_without_launcher_confirms_its_target_too(start: Start, tmp_pa
 
 def test_run_ends_at_its_target_if_the_episodes_cannot_be_played(train: Callable[..., Running], tmp_path: Path) -> None:
     (tmp_path / BUSY).touch()
-    running = train()
+    running = train("--set", "evaluation.final_episodes=1")
     assert running.wait() == 0, running.output
     reason = running.expect("the target cannot be confirmed: (.+)").group(1)
     assert "all 1 ports are in use" in reason

@@ -23,7 +23,7 @@ from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
 TARGET = 195  # mean return; an untrained policy has about 20
-SHORT = ("--set", "collection.envs_per_actor=2", "--set", "evaluation.final_episodes=1")
+SHORT = ("--set", "collection.envs_per_actor=2", "--set", "evaluation.final_episodes=0")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -170,12 +170,13 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
-    small = ("--actors", 1, "--set", "evaluation.final_episodes=1", "--log", "wandb")
+    small = ("--actors", 1, "--set", "evaluation.final_episodes=0", "--log", "wandb")
     first = start("train", "cartpole", "--env-steps", 4000, "--run-dir", "run", *small)
     assert first.wait() == 3, first.output  # the budget ended without the target
     first.expect("wandb: recorded offline; upload the run with: wandb sync .*/run/wandb/offline-run-")
     tracked = wandb_run(tmp_path / "run")
-    assert tracked["summary"]["summary/evaluation.episodes"] == 1
+    first.expect("^not evaluated .evaluation.final_episodes=0.: daedalus evaluate run$")
+    assert "summary/evaluation.episodes" not in tracked["summary"]
     before = newest_checkpoint(tmp_path / "run")
     rows, end = metrics(tmp_path / "run"), summary(tmp_path / "run")
 
@@ -234,7 +235,7 @@ def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ende
 def test_a_killed_actor_and_a_killed_learner_are_restarted_and_training_reaches_its_end(
     start: Start, tmp_path: Path
 ) -> None:
-    settings = (*ENDLESS[:2], *SLOW, "--set", "evaluation.final_episodes=1", "--log-json")
+    settings = (*ENDLESS[:2], *SLOW, "--set", "evaluation.final_episodes=0", "--log-json")
     saving = ("--set", "service.checkpoint_seconds=0.3")
     running = start("train", "cartpole", "--run-dir", "fallen-run", "--env-steps", 10_000, *settings, *saving)
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
@@ -269,9 +270,9 @@ def expect_each_log_record_as_one_json_object(running: Running) -> None:
     }
     plain = [line for line in running.lines if not line.startswith("{")]
     assert not {record["message"] for record in records} & set(plain)
-    *progress, outcome, evaluation, left = [line for line in plain if not re.match(r"evaluation: \d+ of", line)]
+    *progress, outcome, evaluation, left = plain
     assert all(re.search(r"return .* env_steps .* actors \d+$", line) for line in progress), running.output
-    assert (outcome.split(":")[0] in ("solved", "done"), evaluation.split(":")[0]) == (True, "evaluation")
+    assert (outcome.split(":")[0] in ("solved", "done"), evaluation.split(" (")[0]) == (True, "not evaluated")
     assert left.startswith("for a report with the curves: pip install ")
 
 
@@ -282,7 +283,8 @@ def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path, monk
     noise = "        print('noise'); self._step or os.system('echo from a process')\n"
     noisy = source.replace("        self._step += 1\n", f"{noise}        self._step += 1\n")
     (tmp_path / "my_module.py").write_text(noisy.replace("import gymnasium\n", "import os\nimport gymnasium\n", 1))
-    running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, *SHORT, "--run-dir", "own")
+    few = ("--set", "collection.envs_per_actor=2", "--set", "evaluation.final_episodes=1")
+    running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, *few, "--run-dir", "own")
     assert running.wait() == 0, running.output
     assert running.lines.count("noise") < 200
     running.expect(r"[\d,]+ lines of output were not shown; see own/output.log")

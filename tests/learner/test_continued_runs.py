@@ -22,7 +22,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import FORMAT, SavedPolicy
 from daedalus.policy.saving.sealed import write_sealed
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import EvaluationSpec, RunSpec
 
 RUN = Path("runs/one")
 
@@ -139,6 +139,13 @@ def test_a_run_at_its_budget_has_nothing_to_train(run: Path) -> None:
     assert smaller is not None
     assert "the budget is 20:" in smaller.reason
     assert not smaller.to_evaluate
+
+
+def test_a_run_without_final_episodes_has_nothing_to_evaluate(run: Path) -> None:
+    write_json(run / "summary.json", {"env_steps": 5000, "finished": True, "solved": False})
+    spec = run_spec(env_steps=5000)
+    without = spec.model_copy(update={"evaluation": EvaluationSpec(final_episodes=0)})
+    assert [end.to_evaluate for each in (without, spec) if (end := finished_run(run, each))] == [False, True]
 
 
 def test_a_run_that_reached_its_target_has_nothing_to_train(run: Path) -> None:

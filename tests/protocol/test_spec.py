@@ -162,7 +162,7 @@ OUT_OF_RANGE: dict[type[Specification], dict[str, list[Any]]] = {
     EvaluationSpec: {
         "seconds": [0.0],
         "episodes": [0],
-        "final_episodes": [0],
+        "final_episodes": [-1],
         "final_backend": ["mujoco"],
     },
     ServiceSpec: {
