@@ -22,6 +22,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+gc.disable()  # until all tests are collected: what is imported is kept, and nothing of it need be looked at
+
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
 settings.register_profile("daedalus", deadline=None, max_examples=50)  # `make fuzz` tries many more
 settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
@@ -56,6 +58,7 @@ def pytest_collectstart() -> None:
 def pytest_collection_finish() -> None:
     """Leave the modules and the collected tests out of garbage collections, each of which would look at all of them."""
     gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -1,5 +1,6 @@
 """Games whose course is drawn before they begin, and what each agent's rows must then be."""
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -57,6 +58,7 @@ def match(seed: int, number: int, agents: int, *, together: bool) -> tuple[list[
             return first, steps
 
 
+@functools.lru_cache(1024)
 def rows(seed: int, number: int, agents: int, *, together: bool) -> dict[Key, Row]:
     """Return the rows of all agents in a match, by the rule that a reward belongs to the agent's newest action."""
     _, steps = match(seed, number, agents, together=together)
