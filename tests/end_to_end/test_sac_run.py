@@ -11,7 +11,7 @@ from processes import Running
 
 from daedalus.actor.environments.minari_files import Episode, MinariWriter
 
-SHORT = ("--set", "policy.hidden=[16]", "--set", "training.replay_begin=50", "--set", "evaluation.final_episodes=1")
+SHORT = ("--set", "policy.hidden=[16]", "--set", "training.replay_begin=50", "--set", "evaluation.final_episodes=0")
 
 
 def summary(directory: Path) -> dict[str, int]:
