@@ -32,7 +32,7 @@ from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import machine, table, train
 from daedalus.analysis.comparison import estimate, improvement, written
 
-_PEER = Path(__file__).parent / "peer_ppo.py"
+_PEER = Path(__file__).parent / "peer.py"
 _IDENTITY, _RESULTS = ("environment", "env_steps", "seed", "trainer"), ("score", "seconds", "cpu_seconds")
 
 

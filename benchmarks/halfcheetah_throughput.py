@@ -37,7 +37,7 @@ from daedalus.protocol.uploads import RolloutIdentity
 
 _ID, _ROWS = "HalfCheetah-v5", 64
 _MINIBATCHES = 32  # of a batch of 2 x 8 x 128 rows
-_PEER = Path(__file__).parent / "peer_ppo.py"
+_PEER = Path(__file__).parent / "peer.py"
 
 
 def settings(backend: str) -> RunSpec:

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from daedalus.algorithms.gradients import Terms, is_mixed
 from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions, joined
-from daedalus.algorithms.sac import Sac, TwinCritics
+from daedalus.algorithms.sac import SCALED, VALUE_SCALE, Sac, TwinCritics
+from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.optimizers import build_optimizer
@@ -68,8 +69,12 @@ class ReplayLearner(Learner):
         self._algorithm.take_convolutions()
 
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
-        """See Learner."""
-        self._algorithm.continue_from([name.removeprefix("algorithm/") for name in state])
+        """See Learner. Raises CheckpointMismatchError also for critics that would give other values."""
+        if state.get(f"algorithm/{SCALED}") != VALUE_SCALE:
+            raise CheckpointMismatchError(
+                "its critics are those of an earlier version of Daedalus: go on with that one, or begin a run with the "
+                "policy: --init-from RUN_DIRECTORY"
+            )
         super().restore(version, parameters, state)
 
     def learn_from(self, demonstrations: ReplayBuffer) -> None:

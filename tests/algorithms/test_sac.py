@@ -85,7 +85,7 @@ def value(critics: TwinCritics, which: int, *parts: Tensor) -> Tensor:
         if index < len(layers) - 1:
             inputs = inputs - inputs.mean()
             inputs = (inputs / (inputs.square().mean() + 1e-5).sqrt()).clamp(min=0.0)
-    return inputs if len(parts) == 1 else inputs[0]
+    return 10.0 * (inputs if len(parts) == 1 else inputs[0])
 
 
 def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -173,7 +173,7 @@ def test_target_of_a_choice_by_hand() -> None:
         parameter.data.zero_()
     for which in (built.sac.statistics["target_critics"], built.sac.learned["critics"]):
         which.zero_()
-    built.sac.statistics["target_critics"][-8:] = torch.tensor([1.0, 2.0, 3.0, 4.0] + [2.5] * 4)  # the last biases
+    built.sac.statistics["target_critics"][-8:] = torch.tensor([0.1, 0.2, 0.3, 0.4] + [0.25] * 4)  # the last biases
     batch = transitions(spaces=CHOICE)._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
     _, (_, value_loss, entropy, _) = built.sac.gradients(batch)
     assert float(value_loss) == pytest.approx((0.5 + 0.9 * (2.0 + 0.3 * math.log(4.0))) ** 2, rel=1e-5)
@@ -199,7 +199,7 @@ def test_target_by_hand() -> None:
         (built.sac.learned["critics"], (1.0, 4.0)),
     ):
         which.zero_()
-        which[-2:] = torch.tensor(values)  # the biases of the last layer
+        which[-2:] = torch.tensor(values) / 10.0  # the biases of the last layer
     batch = transitions()._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
     torch.manual_seed(5)
     u = torch.randn(2 * ROWS, 3)[ROWS:].double()

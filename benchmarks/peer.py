@@ -1,19 +1,23 @@
-"""Train PPO of stable-baselines3 with all its defaults and 8 environments in one process, and print the result as JSON.
+"""Train PPO or SAC of stable-baselines3 with all its defaults in one process, and print the result as JSON.
 
     pip install -e ".[benchmark]"
-    python -m benchmarks.peer_ppo --env LunarLander-v3 --env-steps 500000 --seed 11
+    python -m benchmarks.peer --env LunarLander-v3 --env-steps 500000 --seed 11
+    python -m benchmarks.peer --env HalfCheetah-v5 --env-steps 100000 --seed 11 --algorithm sac --until 1000
+
+PPO has 8 environments, SAC has one.
 
 Agents of a PettingZoo game that ends for all at once share one policy (parameter sharing): each is an environment of
 its own, and env_steps count steps of the game. Observations of pictures are shrunk to 84 x 84 grey pixels.
 
 It has MultiInputPolicy for Dict observations, CnnPolicy for images, else MlpPolicy. It refuses texts in observations
 and images as small as those of MiniGrid: there it gets the numbers as one array. The score is the mean return of the
-last 100 training episodes.
+last 100 training episodes. With --until, training ends as soon as the mean of the last 5 is so high.
 """
 
 import argparse
 import importlib
 import json
+import math
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -22,25 +26,27 @@ from typing import Any
 import cv2  # pyright: ignore[reportMissingImports]
 import gymnasium
 import numpy as np
-from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+from stable_baselines3 import PPO, SAC  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv  # pyright: ignore[reportMissingImports]
 
-_ENVIRONMENTS, _EPISODES = 8, 100
+_ENVIRONMENTS, _EPISODES = {"ppo": 8, "sac": 1}, 100
+_NEWEST = 5  # episodes whose mean --until waits for
 _SMALLEST_IMAGE = 36  # pixels of the shorter side that its CnnPolicy takes
 
 
 class Returns(BaseCallback):
-    """Collects the returns of all episodes."""
+    """Collects the returns of all episodes, and ends training once the newest are as high as `until`."""
 
-    def __init__(self) -> None:
+    def __init__(self, until: float) -> None:
         super().__init__()
         self.returns: list[float] = []
+        self._until = until
 
     def _on_step(self) -> bool:
         self.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
-        return True
+        return len(self.returns) < _NEWEST or statistics.fmean(self.returns[-_NEWEST:]) < self._until
 
 
 def policy_for(space: gymnasium.Space) -> str:
@@ -121,22 +127,27 @@ def main() -> None:
     options.add_argument("--env", required=True)
     options.add_argument("--env-steps", type=int, required=True)
     options.add_argument("--seed", type=int, required=True)
+    options.add_argument("--algorithm", choices=tuple(_ENVIRONMENTS), default="ppo")
+    options.add_argument(
+        "--until", type=float, default=math.inf, help="mean return of the last 5 episodes; default: none"
+    )
     options.add_argument("--kwargs", type=json.loads, default={}, help="of gymnasium.make, as JSON")
     parsed = options.parse_args()
     module, _, name = parsed.env.rpartition(":")
     if module or name.startswith("ALE/"):
         importlib.import_module(module or "ale_py")  # registers its environments
-    agents = 1
+    agents, copies = 1, _ENVIRONMENTS[parsed.algorithm]
     if name.startswith(("pettingzoo.", "mpe2.")):
         game = importlib.import_module(name)
-        environments = SharedPolicy(lambda: game.parallel_env(**parsed.kwargs), _ENVIRONMENTS, parsed.seed)
-        agents = environments.num_envs // _ENVIRONMENTS
+        environments = SharedPolicy(lambda: game.parallel_env(**parsed.kwargs), copies, parsed.seed)
+        agents = environments.num_envs // copies
     else:
         environments = make_vec_env(
-            name, n_envs=_ENVIRONMENTS, seed=parsed.seed, env_kwargs=parsed.kwargs, wrapper_class=accepted
+            name, n_envs=copies, seed=parsed.seed, env_kwargs=parsed.kwargs, wrapper_class=accepted
         )
-    model = PPO(policy_for(environments.observation_space), environments, seed=parsed.seed, device="cpu")
-    returns = Returns()
+    trainer = PPO if parsed.algorithm == "ppo" else SAC
+    model = trainer(policy_for(environments.observation_space), environments, seed=parsed.seed, device="cpu")
+    returns = Returns(parsed.until)
     began = time.monotonic()
     model.learn(agents * parsed.env_steps, callback=returns)
     seconds = time.monotonic() - began
