@@ -1,5 +1,6 @@
 """Test of mistakes on the command line: one line that says what to do, and an exit status other than 0."""
 
+import re
 import signal
 import subprocess
 from collections.abc import Callable
@@ -17,13 +18,7 @@ Start = Callable[..., Running]
     ("words", "status", "message"),
     [
         (["train", "cartpol"], 2, r"unknown preset 'cartpol': did you mean cartpole"),
-        (["train", "cartpole", "--set", "learning_rate=7"], 2, r"write section.key=value"),
         (["learner", "cartpole", "--algorithm", "absent:A"], 2, "training.algorithm=absent:A: cannot import absent"),
-        (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
-        (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
-        (["train", "cartpole", "--init-from", "nowhere"], 2, r"--init-from: nowhere does not exist"),
-        (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere does not exist: name a run directory"),
-        (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
         (
             ["actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3"],
             1,
@@ -48,6 +43,32 @@ def test_a_mistake_is_reported_in_one_line(
     running.expect(message)
     assert len(running.lines) == 1, running.output
     assert not [entry for entry in tmp_path.iterdir() if entry.is_dir()]  # no run was started
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (["train", "cartpole", "--set", "learning_rate=7"], 2, r"write section.key=value"),
+        (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
+        (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
+        (["train", "cartpole", "--init-from", "nowhere"], 2, r"--init-from: nowhere does not exist"),
+        (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere does not exist: name a run directory"),
+        (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
+    ],
+)
+def test_the_function_of_a_command_reports_a_mistake_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    words: list[str],
+    status: int,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert COMMANDS[words[0]].run(words[1:]) == status
+    (line,) = "".join(capfd.readouterr()).splitlines()
+    assert re.search(message, line)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
