@@ -14,7 +14,6 @@ from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from daedalus.algorithms.algorithm import Algorithm, Forward
 from daedalus.algorithms.forward import FlatParameters
@@ -35,9 +34,6 @@ class TwinCritics(nn.Module):
     Continuous actions are inputs. For a choice, the outputs are the values of all its actions. The convolutions of
     images are the critics': the policy has a copy of them.
 
-    All layers but the last are normalised: Ball et al. (2023), section 4.2. The values are VALUE_SCALE times what the
-    last layer computes.
-
     Attributes:
       choices: A, the number of actions of the choice; 0 if the actions are continuous.
     """
@@ -55,8 +51,6 @@ class TwinCritics(nn.Module):
         # As torch initialises linear layers; [2, inputs, outputs] and [2, 1, outputs].
         self.weights = nn.ParameterList([_uniform(inputs, (2, inputs, outputs)) for inputs, outputs in pairs])
         self.biases = nn.ParameterList([_uniform(inputs, (2, 1, outputs)) for inputs, outputs in pairs])
-        for last in (self.weights[-1], self.biases[-1]):
-            last.data.div_(VALUE_SCALE)  # the first values are as without it
         self._activate = torch.relu if spec.activation == "relu" else torch.tanh
 
     def convolve(self, prepared: Components) -> Components:
@@ -70,21 +64,20 @@ class TwinCritics(nn.Module):
             return self.of_choices(prepared).gather(-1, actions.long().expand(2, *actions.shape)).squeeze(-1)
         hidden, weight, bias = self._hidden(torch.cat([self.encoder(prepared).float(), actions], -1))
         # In full precision, as the heads of ActorCritic. A product with a vector takes six times as long as this sum.
-        return VALUE_SCALE * ((hidden.float() * weight.transpose(1, 2)).sum(-1) + bias.squeeze(-1))
+        return (hidden.float() * weight.transpose(1, 2)).sum(-1) + bias.squeeze(-1)
 
     def of_choices(self, prepared: Components) -> Tensor:
         """Return both values of all A actions of a choice [2, B, A] in observations, which are as in `forward`."""
         hidden, weight, bias = self._hidden(self.encoder(prepared).float())
         with full_precision(hidden):
-            return VALUE_SCALE * torch.baddbmm(bias, hidden.float(), weight)
+            return torch.baddbmm(bias, hidden.float(), weight)
 
     def _hidden(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the outputs [2, B, F'] of all layers but the last, of [B, F], and the weight and bias of that one."""
         hidden = features.expand(2, *features.shape)
         *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for inner_weight, inner_bias in layers:
-            hidden = torch.baddbmm(inner_bias, hidden, inner_weight)
-            hidden = self._activate(functional.layer_norm(hidden, hidden.shape[-1:]))
+            hidden = self._activate(torch.baddbmm(inner_bias, hidden, inner_weight))
         return hidden, weight, bias
 
     def rounded(self) -> "TwinCritics":
@@ -99,10 +92,6 @@ def _uniform(inputs: int, shape: tuple[int, ...]) -> nn.Parameter:
     return nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
 
 
-# Normalised layers have outputs of one size, and Adam moves a weight by the learning rate at most: without the factor,
-# large returns are reached late. After 40,000 env_steps HalfCheetah has twice the return with it (docs/results.md).
-VALUE_SCALE = 10.0
-SCALED = "value_scale"
 # Of the largest entropy of a choice, log A: the target. Christodoulou has 0.98. With as much, few policies that solve a
 # task have the target, and the temperature rises without end: with 0.89 on CartPole (docs/results.md).
 ENTROPY_SHARE = 0.7
@@ -165,7 +154,7 @@ class Sac(Algorithm):
         self._critic_parameters = [self._rounded.get(each, each) for each in critics.parameters()]
         # What optimisers change, besides the policy.
         self.learned = {"critics": self._flat.values, "log_temperature": self._log_temperature}
-        self.statistics = {**self.learned, "target_critics": self._targets, SCALED: torch.tensor(VALUE_SCALE)}
+        self.statistics = {**self.learned, "target_critics": self._targets}
 
     def take_convolutions(self) -> None:
         """Give the critics and their targets the convolutions of the policy."""

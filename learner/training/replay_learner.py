@@ -12,7 +12,7 @@ from torch import Tensor
 
 from daedalus.algorithms.gradients import Terms, is_mixed
 from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions, joined
-from daedalus.algorithms.sac import SCALED, VALUE_SCALE, Sac, TwinCritics
+from daedalus.algorithms.sac import Sac, TwinCritics
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
@@ -70,7 +70,8 @@ class ReplayLearner(Learner):
 
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
         """See Learner. Raises CheckpointMismatchError also for critics that would give other values."""
-        if state.get(f"algorithm/{SCALED}") != VALUE_SCALE:
+        known = {f"algorithm/{name}" for name in self._algorithm.statistics}
+        if any(name.startswith("algorithm/") and name not in known for name in state):
             raise CheckpointMismatchError(
                 "its critics are those of an earlier version of Daedalus: go on with that one, or begin a run with the "
                 "policy: --init-from RUN_DIRECTORY"

@@ -83,9 +83,8 @@ def value(critics: TwinCritics, which: int, *parts: Tensor) -> Tensor:
     for index, (weight, bias) in enumerate(layers):
         inputs = inputs @ weight[which] + bias[which, 0]
         if index < len(layers) - 1:
-            inputs = inputs - inputs.mean()
-            inputs = (inputs / (inputs.square().mean() + 1e-5).sqrt()).clamp(min=0.0)
-    return 10.0 * (inputs if len(parts) == 1 else inputs[0])
+            inputs = inputs.clamp(min=0.0)
+    return inputs if len(parts) == 1 else inputs[0]
 
 
 def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -166,14 +165,6 @@ def test_gradients_of_a_choice_are_those_of_the_papers_losses() -> None:
     check(built, gradients, terms, [value_loss, policy_loss, entropy], ENTROPY_SHARE * math.log(4.0))
 
 
-def test_the_first_values_are_those_of_a_linear_layer_of_torch() -> None:
-    torch.manual_seed(1)
-    critics = TwinCritics(POLICY.model_copy(update={"hidden": (5, 100)}), SPACES, NO_MODULES)
-    for first in (critics.weights[-1], critics.biases[-1]):
-        assert 10.0 * float(first.detach().abs().max()) <= 1.0 / math.sqrt(100)
-    assert 10.0 * float(critics.weights[-1].detach().abs().max()) > 0.9 / math.sqrt(100)
-
-
 def test_target_of_a_choice_by_hand() -> None:
     """Uniform policy of four actions, Q- = (1, 2, 3, 4) and 2.5: y = r + d (mean of (1, 2, 2.5, 2.5) + alpha log 4)."""
     built = Built(spaces=CHOICE)
@@ -181,7 +172,7 @@ def test_target_of_a_choice_by_hand() -> None:
         parameter.data.zero_()
     for which in (built.sac.statistics["target_critics"], built.sac.learned["critics"]):
         which.zero_()
-    built.sac.statistics["target_critics"][-8:] = torch.tensor([0.1, 0.2, 0.3, 0.4] + [0.25] * 4)  # the last biases
+    built.sac.statistics["target_critics"][-8:] = torch.tensor([1.0, 2.0, 3.0, 4.0] + [2.5] * 4)  # the last biases
     batch = transitions(spaces=CHOICE)._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
     _, (_, value_loss, entropy, _) = built.sac.gradients(batch)
     assert float(value_loss) == pytest.approx((0.5 + 0.9 * (2.0 + 0.3 * math.log(4.0))) ** 2, rel=1e-5)
@@ -207,7 +198,7 @@ def test_target_by_hand() -> None:
         (built.sac.learned["critics"], (1.0, 4.0)),
     ):
         which.zero_()
-        which[-2:] = torch.tensor(values) / 10.0  # the biases of the last layer
+        which[-2:] = torch.tensor(values)  # the biases of the last layer
     batch = transitions()._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
     torch.manual_seed(5)
     u = torch.randn(2 * ROWS, 3)[ROWS:].double()

@@ -208,7 +208,7 @@ def test_a_run_of_an_earlier_version_whose_critics_are_others_is_refused() -> No
     learner = trained(ReplayLearner(spec_of(), SPACES), 0, 1)
     state = learner.state()
     ReplayLearner(spec_of(), SPACES).restore(7, learner.weights(), state)
-    del state["algorithm/value_scale"]
+    state["algorithm/layer_norm"] = torch.ones(())
     with pytest.raises(CheckpointMismatchError, match="critics are those of an earlier version"):
         ReplayLearner(spec_of(), SPACES).restore(7, learner.weights(), state)
 
