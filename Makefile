@@ -11,7 +11,7 @@ train: .venv/ready-train
 # Four processes share the tests, also on two cores: many tests wait for the processes that they start, and their files come
 # first. The tests of one file run in one process, because they share what they start.
 test: check
-	$(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest --numprocesses 5 --dist loadfile --no-loadscope-reorder
 
 # The mathematics, the wire, the learner and runs with real processes, in an environment of their own. With the oldest
 # releases that pyproject.toml allows:

@@ -25,7 +25,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 gc.disable()  # until all tests are collected: what is imported is kept, and nothing of it need be looked at
 
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
-settings.register_profile("daedalus", deadline=None, max_examples=50)  # `make fuzz` tries many more
+settings.register_profile("daedalus", deadline=None, max_examples=35)  # `make fuzz` tries many more
 settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
 settings.load_profile("daedalus")
 
@@ -62,10 +62,12 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with the files whose tests start processes, which take longest, so that at the end no worker works alone.
+    """Begin with the files whose tests start processes, and the larger ones, so that at the end no worker works alone.
 
     In `make mutants`, where the first failure ends the tests of a mutant, begin with the fastest tests.
     """
+    sizes = {path: path.stat().st_size for path in {item.path for item in items}}
+    items.sort(key=lambda item: -sizes[item.path])
     items.sort(key=lambda item: not (isinstance(item, pytest.Function) and STARTING & vars(item.module).keys()))
     measured = config.rootpath / "mutmut-stats.json"
     if measured.exists():
