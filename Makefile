@@ -8,8 +8,8 @@ PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
-# Four processes share the tests, also on two cores: many tests wait for the processes that they start, and their files come
-# first. The tests of one file run in one process, because they share what they start.
+# Five processes share the tests, also on two cores: many tests wait for the processes that they start, and their files
+# come first. The tests of one file run in one process, because they share what they start.
 test: check
 	$(BIN)/pytest --numprocesses 5 --dist loadfile --no-loadscope-reorder
 
