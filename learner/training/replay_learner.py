@@ -73,8 +73,8 @@ class ReplayLearner(Learner):
         known = {f"algorithm/{name}" for name in self._algorithm.statistics}
         if any(name.startswith("algorithm/") and name not in known for name in state):
             raise CheckpointMismatchError(
-                "the critics of the run are those of an earlier version of Daedalus: go on with that, or begin a run with "
-                "its policy: --init-from RUN_DIRECTORY"
+                "the critics of the run are those of an earlier version of Daedalus: go on with that, or begin a run "
+                "with its policy: --init-from RUN_DIRECTORY"
             )
         super().restore(version, parameters, state)
 
