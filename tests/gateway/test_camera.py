@@ -122,7 +122,8 @@ def test_all_agents_of_a_game_are_played_and_their_actions_named() -> None:
     assert names == [[f"player_{1 + number % 2} action"] for number in range(len(moments))]
     taken = [choice for moment in moments for choice, _, was_taken in moment.actions[0]["choices"] if was_taken]
     assert len(set(taken)) == len(moments) >= 5  # no field twice
-    assert all(sum(share for _, share, _ in moment.actions[0]["choices"]) > 0.9 for moment in moments)
+    # Of nine equally probable fields, one is in none of the 64 samples in one of 200 runs.
+    assert all(0.5 < sum(share for _, share, _ in moment.actions[0]["choices"]) < 1.001 for moment in moments)
     assert {moment.value for moment in moments} == {1.0}
     assert (moments[0].picture != moments[-1].picture).any()
 
