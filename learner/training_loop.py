@@ -125,7 +125,7 @@ class TrainingLoop:
         soon_after = self._learner.policy_version if self._context.starts > 1 else math.inf
         while not self._context.stop.is_set() and self._counters.env_steps < training.env_steps:
             self._beat()
-            self._update()
+            reporter.look(self._update())
             self._evaluators.serve(self._learner, self._checkpointer)
             now = time.monotonic()
             if self._reaches_target():
@@ -168,8 +168,11 @@ class TrainingLoop:
             return False
         return self._confirmation is None or self._confirmation.confirm(self._learner, self._checkpointer)
 
-    def _update(self) -> None:
-        """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
+    def _update(self) -> Sequence[Upload]:
+        """Train on one batch, publish the result and return the batch; empty without one.
+
+        Return without an update if no batch is complete soon.
+        """
         learner, rollouts = self._learner, self._server.rollouts
         env_steps, progress = self._counters.env_steps, self._context.progress
         version, goes_on = learner.policy_version, learner.updates_due > 0
@@ -179,7 +182,7 @@ class TrainingLoop:
         self._health.left_out = rollouts.left_out
         if not (batch or goes_on):
             self._settle()  # a GPU is done with the newest batch by now
-            return
+            return batch
         began = time.monotonic()
         left_out = self._learn_from(batch, progress)
         learner.anneal_exploration(self._context.spec.training.exploration_annealing(progress, env_steps))
@@ -194,6 +197,7 @@ class TrainingLoop:
         self._health.note_update(now)
         self._counters.learning_seconds += now - began
         self._health.gradient_fault = self._count_skipped()
+        return batch
 
     def _settle(self) -> None:
         """Wait until a GPU has made the updates of the newest batch, and count what was left out of them."""

@@ -4,7 +4,7 @@ The environment's nested spaces are flattened to components, and actions back (a
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ from daedalus.protocol.models import PositiveInt, Specification
 
 LARGEST_OBSERVATION = 1e15  # of a number in an observation: beyond it squares overflow float32
 LARGEST_REWARD = 1e9  # as learning sees it: the learner (learner/serving/rollout_judge.py) rejects larger ones
+_FEWEST_ROWS, _FEWEST_EPISODES = 50, 3  # after which an observation that does not change is a fault
 _MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
 _MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an output for each
 _MAX_COMPONENTS = 64
@@ -35,6 +36,47 @@ def unfit_number(values: np.ndarray) -> str:
         return f"has a value that is not finite ({values[~np.isfinite(values)][0]})"
     beyond = low if low < -LARGEST_OBSERVATION else high
     return f"has a value beyond +-{LARGEST_OBSERVATION:g}: scale or clip the observations (it is {beyond:g})"
+
+
+class StillObservations:
+    """What of the observations has not changed so far: all of a game that draws nothing, a camera that stands still."""
+
+    def __init__(self) -> None:
+        self._changed: dict[str, bool] = {}  # by component: at all, also from one episode to the next
+        self._moves = False  # whether anything changed within an episode
+        self._compared = 0  # rows that go on
+
+    def add(self, frames: Mapping[str, np.ndarray], goes_on: np.ndarray) -> None:
+        """Look at rows that follow each other.
+
+        Args:
+          frames: components [T+1, E, ...].
+          goes_on: [T, E], whether the row after is of the same episode, and not its last.
+        """
+        self._compared += int(goes_on.sum())
+        for name, rows in frames.items():
+            if not (self._moves and self._changed.get(name, False)):
+                differs = (rows[1:] != rows[:-1]).reshape(*goes_on.shape, -1).any(2)
+                self._changed[name] = self._changed.get(name, False) or bool(differs.any())
+                self._moves |= bool((differs & goes_on).any())
+
+    def text(self, episodes: int) -> str:
+        """Return what is wrong after so many episodes, with what to do; empty if nothing is, or it is too early."""
+        if self._compared < _FEWEST_ROWS:
+            return ""
+        if not self._moves:
+            return (
+                f"the observation has changed in none of {self._compared:,} rows within an episode, so that the policy "
+                "cannot see what happens: look at what it comes from. Some environments draw their pictures only with "
+                "--set environment.kwargs.render_mode=rgb_array"
+            )
+        still = [name for name, changed in self._changed.items() if not changed]
+        if not still or episodes < _FEWEST_EPISODES:
+            return ""
+        return (
+            f"observation component {still[0]!r} is the same in all {self._compared:,} rows and {episodes:,} episodes "
+            f"so far: look at the sensor or camera that it comes from, or leave it out (environment.leave_out)"
+        )
 
 
 def unfit_code(values: np.ndarray, codes: Sequence[int]) -> str:

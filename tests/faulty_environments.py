@@ -14,7 +14,7 @@ from gymnasium.spaces import Box, Discrete
 
 
 class Faulty(gymnasium.Env[Any, Any]):
-    """Environment whose observation is [0.5, 0.5] and whose episodes have 10 steps, with one fault."""
+    """Environment that observes 0.5 and the step, and whose episodes have 10 steps, with one fault."""
 
     observation_space = Box(-1.0, 1.0, (2,), np.float32)
     action_space = Discrete(2)
@@ -41,12 +41,12 @@ class Faulty(gymnasium.Env[Any, Any]):
         return super().__getattribute__(name)
 
     def _observe(self) -> Any:
-        good = np.full(2, 0.5, np.float32)
+        good = np.array([0.5, self._step % 10 / 10], np.float32)
         faulty = {
             "shape": np.zeros(3, np.float32),
             "dtype": good.astype(np.complex64),
             "nan": np.array([0.0, np.nan], np.float32),
-            "bounds": np.array([0.0, 731.5], np.float32),
+            "bounds": np.array([good[1], 731.5], np.float32),
             "none": None,
             "map": np.full((20, 20), self._value, np.uint8),
             "three numbers": np.zeros(3, np.float32),

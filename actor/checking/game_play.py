@@ -18,7 +18,7 @@ from daedalus.actor.environments.gymnasium_environments import limited_close
 from daedalus.actor.environments.roles import DifferentSpacesError
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.policy.user_modules import UserModuleError, UserModules
-from daedalus.protocol.spaces import unfit_number
+from daedalus.protocol.spaces import StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
 _LOOKED_AT = 200  # steps whose observations are compared with their space: it takes longer than most steps
@@ -70,6 +70,7 @@ def _played(
     warnings: dict[str, str] = {}
     began = time.monotonic()
     observed = environments.reset(seed)
+    before, still = {name: frames.copy() for name, frames in observed.frames.items()}, StillObservations()
     reset_seconds, busy = time.monotonic() - began, 0.0
     lengths, returns, steps, length, total = [], [], 0, 0, np.zeros(games.count)
     until, stepping = time.monotonic() + seconds, 0.0
@@ -78,7 +79,7 @@ def _played(
             random.choose({name: mask[[seat]] for name, mask in observed.masks.items()}) for seat in range(games.count)
         ]
         began, began_busy = time.monotonic(), time.process_time()
-        observed, rewards, _, _ = environments.step(
+        observed, rewards, terminated, truncated = environments.step(
             {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
         )
         stepping, busy = stepping + time.monotonic() - began, busy + time.process_time() - began_busy
@@ -86,6 +87,9 @@ def _played(
         assert observed.over is not None
         steps, length, total = steps + 1, length + 1, total + rewards
         _refuse_unfit(games, observed.frames, rewards)
+        goes_on = observed.acting & ~(terminated | truncated) & (length > 0)  # no step that only resets
+        still.add({name: np.stack([frames, observed.frames[name]]) for name, frames in before.items()}, goes_on[None])
+        before = {name: frames.copy() for name, frames in observed.frames.items()}
         if steps <= _LOOKED_AT:
             for seat, row in enumerate(iterate(batch, games.observations)):
                 if observed.acting[seat]:
@@ -97,6 +101,8 @@ def _played(
             lengths.append(length)
             returns.append(float(total.mean()))
             length, total = -1, np.zeros(games.count)  # the next step only resets
+    if text := still.text(len(lengths)):
+        warnings["still"] = f"environment {spec.id}: {text}"
     return {
         "warnings": tuple(warnings.values()),
         "env_steps": steps,

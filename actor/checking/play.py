@@ -34,7 +34,7 @@ from daedalus.actor.environments.transforms import TransformedEnvironment, Trans
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
 from daedalus.policy.user_code import first_line, place_of, print_traceback
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
-from daedalus.protocol.spaces import ArraySpace, Spaces, unfit_number
+from daedalus.protocol.spaces import ArraySpace, Spaces, StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -304,6 +304,7 @@ class _Play:
         self._observation_space = observation_space  # without what is left out
         self._transforms, self._random_actions = transforms, random_actions
         self._precision = Precision(observation_space)
+        self._still, self._newest = StillObservations(), dict[str, np.ndarray]()  # the newest observation
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
         self._warnings = {text: text for text in unsaved_statistics(environment)}  # the first of each kind
@@ -336,7 +337,8 @@ class _Play:
 
     def report(self) -> EnvironmentReport:
         """Return what was found."""
-        warnings = [*self._warnings.values(), *self._precision.warnings.values()]
+        still = self._still.text(len(self._lengths))
+        warnings = [*self._warnings.values(), *self._precision.warnings.values(), *filter(None, [still])]
         problems = [*self._problems, *([self._texts.problem] if self._texts.problem else [])]
         return EnvironmentReport(
             spaces=self._transforms.spaces,
@@ -404,6 +406,9 @@ class _Play:
             raise _ProblemError(str(error)) from None
         self._precision.add(observation, starts=starts)
         self._masks = observed.masks
+        before, self._newest = self._newest, observed.frames
+        rows = {name: np.stack([frames, observed.frames[name]])[:, None] for name, frames in before.items()}
+        self._still.add(rows, np.array([[bool(before) and not (starts or over)]]))
         for name, largest in self._byte_maxima.items():
             np.maximum(largest, observed.frames[name].reshape(-1, len(largest)).max(0), out=largest)
 

@@ -1,12 +1,14 @@
 """Hints for the user where a run does not learn, or no episode ends. State; no I/O."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol.spaces import StillObservations
 from daedalus.protocol.spec import TrainingSpec
 from daedalus.protocol.texts import exact_number, short_number
+from daedalus.protocol.uploads import Rollout, Upload
 
 _BASELINE_EPISODES = 20  # after so many, the policy is still about as random as at the start,
 _BASELINE_PROGRESS = 0.05  # unless they took more than this share of the budget
@@ -97,6 +99,35 @@ class LearningHint:
                 f"try {normalize}a smaller training.learning_rate"
             )
         return ""
+
+
+_LOOKED_AT = 4096  # rows whose observations are compared
+
+
+class ObservationHint:
+    """Hint that the observations of the first rollouts, or a component of them, did not change; given once."""
+
+    def __init__(self) -> None:
+        self._still, self._rows, self._episodes = StillObservations(), 0, 0
+        self._due = ""
+
+    def look(self, uploads: Sequence[Upload]) -> None:
+        """Look at a batch. Gradients show no observations."""
+        for rollout in uploads:
+            if self._rows >= _LOOKED_AT or not isinstance(rollout, Rollout):
+                return
+            rows = rollout.rows + 1  # without the frames before the first row
+            goes_on = rollout.valid & ~(rollout.terminated | rollout.truncated)
+            self._still.add({name: frames[-rows:] for name, frames in rollout.frames.items()}, goes_on)
+            self._rows += goes_on.size
+            self._episodes += len(rollout.episode_returns)
+            if self._rows >= _LOOKED_AT:
+                self._due = self._still.text(self._episodes)
+
+    def take(self) -> str:
+        """Return the hint if it is due, once, else an empty string."""
+        due, self._due = self._due, ""
+        return due
 
 
 # env_steps in each environment without the end of an episode after which a hint is given; the least in a small budget.

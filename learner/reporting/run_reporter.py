@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from daedalus.learner.reporting.bottleneck import bottleneck
 from daedalus.learner.reporting.csv_writer import cut_rows
-from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint
+from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint, ObservationHint
 from daedalus.learner.reporting.metrics_rows import ENV, LESSON, Details, league_columns, read_rows
 from daedalus.learner.reporting.rates import RateMeter
 from daedalus.learner.reporting.recorder import Recorder
@@ -27,6 +28,7 @@ from daedalus.policy.saving.best_checkpoints import set_aside_newer
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.releases import own_release
+from daedalus.protocol.uploads import Upload
 from daedalus.transport.process_usage import UsageMeter
 
 if TYPE_CHECKING:
@@ -68,6 +70,7 @@ class RunReporter:
         self._usage = UsageMeter()
         self._episode_hint = EpisodeHint(training.env_steps)
         self._learning_hint = LearningHint(training)
+        self._observation_hint = ObservationHint()
 
     def begin(self, recorder: Recorder, now: float) -> None:
         """Start to measure rates, at the start of training. The recorder is closed with the reporter."""
@@ -75,6 +78,10 @@ class RunReporter:
         self._meter = RateMeter(self._counters, now)
         health.updated = health.awaited_since = health.actor_seen = now
         health.recording_since = lambda: recorder.busy_since
+
+    def look(self, batch: Sequence[Upload]) -> None:
+        """Look at the observations of a batch that was trained on."""
+        self._observation_hint.look(batch)
 
     def record(self, learner: "Learner", now: float, *, last: bool = False) -> None:
         """Record a row of metrics, and log a hint if one is due. `last` marks the row of a stop."""
@@ -154,7 +161,7 @@ class RunReporter:
         """Return a hint for the user if one is due, else an empty string."""
         with self._context.lock:
             hint = self._episode_hint.take(self._counters, self._context.fleet)
-        return hint or self._learning_hint.take()
+        return hint or self._observation_hint.take() or self._learning_hint.take()
 
     def _details(self, learner: "Learner", now: float, *, last: bool = False) -> Details:
         """Return the distributions and the picture that belong to a metrics row; most rows have none."""

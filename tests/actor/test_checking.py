@@ -127,6 +127,49 @@ def test_a_good_environment_is_measured() -> None:
     assert report == EnvironmentReport.model_validate_json(report.model_dump_json())
 
 
+class Sensors(gymnasium.Env):
+    """Two sensors and episodes of 20 steps; `changes`: the sensors that show the step, others show the episode."""
+
+    observation_space = Dict(camera=Box(0, 255, (8, 8, 3), np.uint8), joint=Box(0.0, 1000.0, (1,), np.float32))
+    action_space = Discrete(2)
+
+    def __init__(self, changes: list[str], stopped: bool = False) -> None:
+        self.changes, self.number, self.steps, self.stopped = changes, 0, 0, stopped
+
+    def observe(self) -> dict[str, np.ndarray]:
+        shown = {
+            name: self.steps if name in self.changes else 0 if self.stopped else self.number
+            for name in ("camera", "joint")
+        }
+        return {"camera": np.full((8, 8, 3), shown["camera"], np.uint8), "joint": np.float32([shown["joint"]])}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.number, self.steps = self.number + 1, 0
+        return self.observe(), {}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        return self.observe(), 0.0, self.steps == 20, False, {}
+
+
+def test_observations_that_stand_still_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gymnasium.registry, "Sensors-v0", EnvSpec("Sensors-v0", entry_point=Sensors))
+
+    def warned(steps: int, *changes: str, stopped: bool = False) -> list[str]:
+        spec = EnvironmentSpec(id="Sensors-v0", kwargs={"changes": list(changes), "stopped": stopped})
+        report = check_environment(spec, UserModules(), seconds=60.0, env_steps=steps)
+        return [warning.removeprefix("environment Sensors-v0: ") for warning in report.warnings]
+
+    (nothing,) = warned(100)  # each episode has another picture
+    assert nothing.startswith("the observation has changed in none of 95 rows within an episode, so that the policy ca")
+    assert nothing.endswith("only with --set environment.kwargs.render_mode=rgb_array")
+    assert warned(50) == []  # too early
+    assert warned(100, "joint") == warned(100, "camera", "joint") == []  # the camera may show the goal of the episode
+    (camera,) = warned(100, "joint", stopped=True)
+    assert camera.startswith("observation component 'camera' is the same in all 95 rows and 5 episodes so far: look at")
+    assert warned(50, "joint", stopped=True) == warned(55, "joint", stopped=True) == []
+
+
 def test_without_play_only_the_spaces_are_read() -> None:
     report = check("nan", seconds=0.0)
     assert report.spaces is not None

@@ -429,6 +429,17 @@ class Duel(ParallelEnv):
         return {agent: {"action_mask": mask} for agent in self.possible_agents}
 
 
+def test_a_game_whose_observations_stand_still_is_a_warning() -> None:
+    def warnings(game: str) -> tuple[str, ...]:
+        spec = EnvironmentSpec(id=game, backend="pettingzoo")
+        modules = UserModules(frozenset({"test_games"}))
+        return check_environment(spec, modules, seconds=60.0, env_steps=40).warnings
+
+    (still,) = warnings("test_games:Duel")  # four of five steps, because the last ends the match
+    assert still.startswith("environment test_games:Duel: the observation has changed in none of 56 rows within an epi")
+    assert warnings("pettingzoo.classic.tictactoe_v3") == ()
+
+
 def dark(render_mode: str) -> Duel:
     return Duel()
 

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
+from building import make_rollout
 
-from daedalus.learner.reporting.learning_hints import LearningHint
+from daedalus.learner.reporting.learning_hints import LearningHint, ObservationHint
 from daedalus.protocol.spec import TrainingSpec
 
 
@@ -109,3 +111,23 @@ def test_rows_without_returns_are_no_reason_for_a_hint_and_delay_it() -> None:
 def test_run_is_not_judged_without_its_first_episodes() -> None:
     assert hints(row(0.06, -200.0, 1.4), row(0.2, -200.0, 0.1)) == ["", ""]  # resumed, or very long episodes
     assert hints(row(0.01, -200.0, 1.4, episodes=19), row(0.2, -200.0, 0.1, episodes=19)) == ["", ""]
+
+
+@pytest.mark.parametrize("changes", ["nothing", "episodes", "first frame of a stack", "rows"])
+def test_observations_that_stand_still_get_a_hint_once(changes: str) -> None:
+    """A picture that changes from episode to episode, and in frames that no row has as its newest, stands still."""
+    hint, given = ObservationHint(), []
+    for number in range(6):
+        rollout = make_rollout(rows=128, environments=8, stack=4, seed=number)
+        frames = np.zeros_like(rollout.frames["observation"])
+        if changes == "episodes":
+            frames[3:] = 1.0 + np.concatenate([np.zeros((1, 8)), np.cumsum(~rollout.valid, 0)])[..., None]
+        elif changes == "first frame of a stack":
+            frames[0] = 1.0
+        elif changes == "rows" and number == 3:
+            frames[60:] = 1.0
+        hint.look([make_rollout(rows=128, environments=8, stack=4, seed=number, frames=frames)])
+        given.append(hint.take())
+    assert [bool(text) for text in given] == [False, False, False, changes != "rows", False, False]
+    if changes != "rows":
+        assert given[3].startswith("the observation has changed in none of 2,")
