@@ -1,6 +1,7 @@
 """Curiosity: a reward for observations that are new in their episode. State; no threads."""
 
 import logging
+import math
 import zlib
 from collections import deque
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ _JUDGED_ROWS = 4096  # the first ones
 _LARGEST = 10.0  # reward at a weight of 1, as that of normalised rewards
 _EPISODES = 100
 _FEWEST_EPISODES = 20  # whose totals say something
+_DROP = 0.5  # of the mean return below its best, in deviations of returns, at which nothing is rewarded
 _DEVIATION = 0.25  # of the totals, below which the reward shrinks
 _MOST_NEW = 0.95  # share of first visits, above which observations do not come back, and nothing is rewarded
 
@@ -87,15 +89,19 @@ def _codes(rollout: Rollout) -> list[list[int]]:
 class Curiosity:
     """Rewards for first visits, which the learner adds to those of the environment.
 
-        b_t = w min(1 / d, 10) min(4 v, 1) if s_{t+1} is new in its episode, else 0
+        b_t = w min(1 / d, 10) min(4 v, 1) max(1 - 2 f, 0) if s_{t+1} is new in its episode, else 0
 
     with a weight w, d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for the
-    rewards of the environment (RewardNormalizer), and v the deviation of the number of different observations of an
+    rewards of the environment (RewardNormalizer), v the deviation of the number of different observations of an
     episode, over the newest 100: where all episodes have equally many, no way to act finds more, and their order is
     noise that hides the rewards of the environment. Where each episode has another map, this term alone explores as
     well as together with the prediction errors that it was added to at first: Wang et al. (2023), "Revisiting Intrinsic
     Reward for Exploration in Procedurally Generated Environments". Where nearly every observation is new, the term
     would reward long episodes alone: after the first rows it is 0, until the run is resumed.
+
+    f is how far the mean return of the newest 100 episodes has fallen below its best, in deviations of the returns at
+    that time: a policy that explores for its own sake, and never ends an episode, is not what the run is for. The bound
+    is that of Chen et al. (2022), "Redeeming Intrinsic Rewards via Constrained Optimization", by this simpler rule.
     """
 
     def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:
@@ -106,6 +112,8 @@ class Curiosity:
         self._factor = 0.0  # of the newest batch
         self._rows = self._new = 0  # among the first rows; it has judged them if there are enough
         self._rewards = True
+        self._returns = deque[float](maxlen=_EPISODES)  # of the environment, of the newest episodes
+        self._best, self._spread, self._ended = -math.inf, 0.0, 0
 
     @property
     def statistics(self) -> dict[str, Tensor]:
@@ -119,7 +127,9 @@ class Curiosity:
         self._scale.moments.merge(self._scale.moments_of(counted))
         if self._rows < _JUDGED_ROWS:
             self._judge()
-        self._factor = weight * min(1.0 / self._scale.divisor, _LARGEST) * self._choice() if self._rewards else 0.0
+        self._follow(rollouts)
+        scale = min(1.0 / self._scale.divisor, _LARGEST)
+        self._factor = weight * scale * self._choice() * self._harmless() if self._rewards else 0.0
 
     def add_to(self, batch: Batch, rollouts: Sequence[Rollout]) -> None:
         """Add the rewards of rollouts to those of their batch in place. Rollouts not looked at have none."""
@@ -141,6 +151,21 @@ class Curiosity:
         """Return the part of the reward that is given, from 0 to 1: how much the episodes differ in what they find."""
         totals = self._visits.totals
         return min(float(np.std(totals)) / _DEVIATION, 1.0) if len(totals) >= _FEWEST_EPISODES else 1.0
+
+    def _follow(self, rollouts: Sequence[Rollout]) -> None:
+        """Take note of the returns of the episodes that ended, and of the best mean of as many as are looked at."""
+        for each in rollouts:
+            self._returns.extend(each.episode_returns.tolist())
+            self._ended += len(each.episode_returns)
+        if self._ended >= _EPISODES:
+            self._ended = 0
+            if (mean := float(np.mean(self._returns))) > self._best:
+                self._best, self._spread = mean, float(np.std(self._returns))
+
+    def _harmless(self) -> float:
+        """Return the part of the reward that is given, from 0 to 1: less the further the mean return has fallen."""
+        drop = self._best - float(np.mean(self._returns)) if len(self._returns) == _EPISODES else 0.0
+        return 1.0 if drop <= 0.0 else max(1.0 - drop / max(_DROP * self._spread, 1e-12), 0.0)
 
     def _judge(self) -> None:
         """Stop rewarding, after enough rows, if observations do not come back."""

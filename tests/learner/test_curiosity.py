@@ -162,6 +162,29 @@ def test_reward_fades_where_all_episodes_have_equally_many_observations(other: i
     assert bool(expected) == bool(other)
 
 
+def test_reward_shrinks_while_the_mean_return_is_below_its_best() -> None:
+    """The first 100 episodes have the mean 1 and the deviation 2: 0.5 less halves the reward, 1 less ends it."""
+
+    def rollout(*returns: float) -> Rollout:
+        lengths = np.ones(len(returns), np.int32)
+        return make_rollout(environments=20, rows=20, episode_returns=np.array(returns), episode_lengths=lengths)
+
+    curious = curiosity.Curiosity(DISCOUNT)
+
+    def factor(*returns: float) -> float:
+        curious.look([rollout(*returns)], 1.0)
+        metrics = curious.metrics()
+        return metrics["curiosity_reward_mean"] / metrics["first_visit_fraction"]
+
+    at_first = factor(-1.0, 3.0)  # too few episodes
+    assert factor(*[-1.0] * 49, *[3.0] * 49) == pytest.approx(at_first, rel=0.1)
+    assert factor(*[0.5] * 100) == pytest.approx(0.5 * at_first, rel=0.1)
+    assert factor(*[0.0] * 100) == factor(*[-9.0] * 100) == 0.0
+    assert factor(*[1.0] * 50) == 0.0  # with 50 that had -9
+    assert factor(*[1.0] * 50) == pytest.approx(at_first, rel=0.1)
+    assert factor(*[2.0] * 100) > 0.0  # a new best
+
+
 def test_curiosity_refuses_gradients_of_actors() -> None:
     content = run_spec(algorithm="a3c", curiosity=1.0).model_dump()
     content["collection"]["upload"] = "gradients"
