@@ -16,13 +16,14 @@ _JUDGED_PROGRESS, _WATCHED_PROGRESS = 0.2, 0.1  # shares of the budget: of the j
 _LEAST_ROWS = 5
 _BETTER = 0.25  # standard deviations of the first episodes by which a mean return is better
 _COLLAPSED = 0.1  # of the first entropy
+_EXPLAINS = 0.001  # explained variance of a value that does not depend on the observation, or hardly
 
 
 class LearningHint:
     """Judge of a run after a fifth of its budget, by its metrics rows.
 
     A run has nothing to learn from where all returns are equal. It does not learn where the entropy has collapsed or
-    the explained variance stayed below 0, unless the mean return is higher than that of the first episodes, or the
+    the explained variance stayed at or below 0, unless the mean return is higher than that of the first episodes, or the
     newest evaluation better than the first. Runs that were resumed after the first episodes are not judged, nor games
     with opponents, whose returns say nothing about the strength of play.
     """
@@ -92,10 +93,10 @@ class LearningHint:
                 f"this run does not learn: {returns}, and the entropy fell from {first:.3g} to {entropy:.3g}, so the "
                 "policy explores no more; try a larger training.entropy_bonus or a smaller training.learning_rate"
             )
-        if len(self._explained) >= _LEAST_ROWS and max(self._explained) < 0.0:
+        if len(self._explained) >= _LEAST_ROWS and max(self._explained) < _EXPLAINS:
             normalize = "" if self._normalizes_rewards else "training.normalize_rewards=true or "
             return (
-                f"this run does not learn: {returns}, and the explained variance of the value stays below 0; "
+                f"this run does not learn: {returns}, and the value explains nothing of the returns; "
                 f"try {normalize}a smaller training.learning_rate"
             )
         return ""

@@ -76,9 +76,11 @@ def test_run_whose_critic_explains_nothing_gets_a_hint() -> None:
     watched = [row(0.1 + 0.02 * index, 0.0, 1.0, -0.1) for index in range(6)]
     *before, last = hints(row(0.01, 0.0, 1.0, -5.0), *watched)
     assert set(before) == {""}
-    assert "the explained variance of the value stays below 0; try training.normalize_rewards=true" in last
+    assert "the value explains nothing of the returns; try training.normalize_rewards=true" in last
     normalizing = hints(row(0.01, 0.0, 1.0, -5.0), *watched, normalize_rewards=True)[-1]
-    assert normalizing.endswith("stays below 0; try a smaller training.learning_rate")
+    assert normalizing.endswith("explains nothing of the returns; try a smaller training.learning_rate")
+    constant = [row(0.1 + 0.02 * index, 0.0, 1.0, 6e-8) for index in range(6)]  # as of a network whose units are dead
+    assert "explains nothing" in hints(row(0.01, 0.0, 1.0), *constant)[-1]
     watched[3]["explained_variance"] = 0.1
     assert set(hints(row(0.01, 0.0, 1.0), *watched)) == {""}
 
