@@ -23,9 +23,9 @@ class LearningHint:
     """Judge of a run after a fifth of its budget, by its metrics rows.
 
     A run has nothing to learn from where all returns are equal. It does not learn where the entropy has collapsed or
-    the explained variance stayed at or below 0, unless the mean return is higher than that of the first episodes, or the
-    newest evaluation better than the first. Runs that were resumed after the first episodes are not judged, nor games
-    with opponents, whose returns say nothing about the strength of play.
+    the explained variance stayed at or below 0, unless the mean return is higher than that of the first episodes, or
+    the newest evaluation better than the first. Runs that were resumed after the first episodes are not judged, nor
+    games with opponents, whose returns say nothing about the strength of play.
     """
 
     def __init__(self, training: TrainingSpec) -> None:
