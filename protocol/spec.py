@@ -6,6 +6,7 @@ its description in the reference of all settings. This file does not know where 
 file, the command line) or how it is used.
 """
 
+import copy
 import math
 import re
 from typing import Annotated, Any, Literal, TypeVar
@@ -157,8 +158,11 @@ class EnvironmentSpec(Specification):
 
     @property
     def constructor_kwargs(self) -> dict[str, JsonValue]:
-        """Arguments of the environment's constructor: `kwargs` and `training_kwargs`."""
-        return {**self.kwargs, **self.training_kwargs}
+        """Arguments of an environment's constructor: `kwargs` and `training_kwargs`.
+
+        They are a copy: an environment may change a map or a list in place, which the next one must not see.
+        """
+        return copy.deepcopy({**self.kwargs, **self.training_kwargs})
 
     @property
     def user_modules(self) -> dict[str, str]:

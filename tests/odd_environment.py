@@ -46,6 +46,13 @@ class Odd(gymnasium.Env[Any, Any]):
             raise ConnectionError("already disconnected")
 
 
+class Popping(Odd):
+    """Odd, whose constructor takes its options out of a map."""
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        super().__init__(masks=options.pop("masks"))
+
+
 class Vector(VectorEnv[Any, Any, Any]):
     """The same as Odd, for several at once, with one fault or oddity."""
 

@@ -1,5 +1,6 @@
 """What observations are besides their spaces: texts, codes. And gymnasium's own environment checker."""
 
+import copy
 import functools
 import importlib
 import re
@@ -125,7 +126,7 @@ def gymnasium_notes(spec: EnvironmentSpec, modules: UserModules) -> tuple[str, .
             registered = registration(spec.id, modules)
             if registered.entry_point is None:
                 return ()
-            kwargs: dict[str, Any] = {**spec.kwargs}
+            kwargs: dict[str, Any] = copy.deepcopy(spec.kwargs)  # which it may change in place
             environment = gymnasium.make(registered, disable_env_checker=True, **kwargs).unwrapped
     except EnvironmentSetupError:
         return ()  # reported before

@@ -109,6 +109,16 @@ def test_component_without_a_fixed_shape_can_be_left_out(processes: bool) -> Non
         assert environments.step({"action": np.array([[0], [1]])})[1].tolist() == [1.0, 1.0]
 
 
+def test_environments_do_not_share_what_their_constructor_changes_in_place() -> None:
+    given = {"options": {"masks": "lists"}}
+    checked = spec("Popping", **given)
+    assert problems(checked) == ()
+    gymnasium_notes(checked, MODULES)
+    with closing(make_environments(checked, 3, modules=MODULES)) as environments:
+        assert environments.reset(1).masks["arm"].tolist() == [[True, False]] * 3
+    assert checked.kwargs == given
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_seeds_of_training_fit_an_int_of_c(seed: int) -> None:
     collect(started_collector(spec(), First(), count=2, rollout_length=4, seed=seed, modules=MODULES))
