@@ -103,9 +103,13 @@ ComponentName = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,64}$")]
 def colours_last(shape: tuple[int, ...]) -> bool:
     """Return whether an image is (height, width, colours); else (colours, height, width), or (height, width) alone.
 
-    The colours are on the shorter of the first and the last of three axes.
+    If only two neighbouring axes of the three are equal, they are the height and the width: a board may have more
+    planes than rows. Else the colours are on the shorter of the first and the last axis.
     """
-    return len(shape) == 3 and shape[-1] < shape[0]
+    if len(shape) != 3:
+        return False
+    first, middle, last = shape
+    return last < first if (first == middle) == (middle == last) else first == middle
 
 
 class ArraySpace(Specification):

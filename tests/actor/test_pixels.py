@@ -10,6 +10,7 @@ import pytest
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.pixels import Pixels, crop, grey, resize
+from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -96,6 +97,22 @@ def test_colours_may_come_first() -> None:
     np.testing.assert_array_equal(pixels(images.transpose(0, 3, 1, 2)), expected.transpose(0, 3, 1, 2))
     luma = Pixels(EnvironmentSpec(id="x", grey=True), _space(3, 10, 12))(images.transpose(0, 3, 1, 2))
     np.testing.assert_array_equal(luma, grey(images))
+
+
+@pytest.mark.parametrize(
+    ("shape", "image"),
+    [
+        ((20, 30, 3), (3, 20, 30)),
+        ((3, 20, 30), (3, 20, 30)),
+        ((84, 84, 4), (4, 84, 84)),
+        ((16, 16, 27), (27, 16, 16)),  # a board with more planes than rows
+        ((27, 16, 16), (27, 16, 16)),
+        ((16, 16, 16), (16, 16, 16)),
+    ],
+)
+def test_equal_neighbouring_axes_are_height_and_width(shape: tuple[int, ...], image: tuple[int, ...]) -> None:
+    assert ArraySpace(shape=shape, dtype="uint8").image_shape == image
+    assert Pixels(EnvironmentSpec(id="x", resize=(5, 6)), _space(*shape)).shape in ((image[0], 5, 6), (5, 6, image[0]))
 
 
 @pytest.mark.parametrize("frame", [(20, 30, 3), (3, 20, 30), (20, 30), (20, 30, 1), (1, 20, 30)])
