@@ -52,6 +52,8 @@ def advice(report: EnvironmentReport, spec: RunSpec, processors: int) -> list[st
         f"{slow}; use --set environment.processes=true" if slow else "",
         float_images(report, spec),
         stacked_images(report, spec),
+        reduced_images(report, spec),
+        planes_first(report, spec),
         small_bytes(report, spec),
         uninformative_bounds(report),
         replay_instead(report, spec),
@@ -121,6 +123,41 @@ def stacked_images(report: EnvironmentReport, spec: RunSpec) -> str:
                 f"{name!r} is a {space}, which goes through a multilayer perceptron: one image has two or three axes; "
                 "return one, of uint8, and stack frames with environment.frame_stack"
             )
+    return ""
+
+
+def reduced_images(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return what the default settings remove from an image, or an empty string.
+
+    The spaces are those of the environment with the transforms that the user has chosen.
+    """
+    chosen = spec.environment
+    for name, space in report.spaces.observations.items() if report.spaces is not None else ():
+        if not isinstance(space, ArraySpace) or not space.is_image:
+            continue
+        parts, remedies = [], []
+        if chosen.grey and space.image_shape[0] == 3:
+            parts, remedies = ["grey"], ["if colours matter, use --set environment.grey=false"]
+        if chosen.resize is not None and space.image_shape[1:] != chosen.resize:
+            parts.append("{} x {} pixels small".format(*chosen.resize))
+            remedies.append("if small details matter, --set environment.resize=[HEIGHT,WIDTH]")
+        if parts:
+            return f"{name!r} is a {space}, and is made {' and '.join(parts)} for the policy: {'; '.join(remedies)}"
+    return ""
+
+
+def planes_first(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if the encoder `grid`, which reads maps (height, width, planes), may get others; else nothing."""
+    if spec.policy.encoder != "grid" or report.spaces is None:
+        return ""
+    for name, space in report.spaces.observations.items():
+        if isinstance(space, ArraySpace) and len(space.shape) == 3 and space.shape[0] != space.shape[1]:
+            height, width, planes = space.shape
+            if width == planes:
+                return (
+                    f"policy.encoder=grid reads {name!r} as {height} x {width} cells with {planes} planes: if it has "
+                    f"{height} planes of {width} x {planes} cells, put the planes last in a wrapper (--wrap)"
+                )
     return ""
 
 

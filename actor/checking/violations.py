@@ -74,8 +74,12 @@ def _array_violations(space: gymnasium.spaces.Box, value: Any, what: str, where:
         yield "problem", f"{what} with the value {array[index]:g} at index {_index(index)}: {limit}"
     elif (outside := (array < space.low) | (array > space.high)).any():
         index = _first(outside)
-        bounds = f"from {space.low[index]:g} to {space.high[index]:g}"
-        yield "warning", f"{what} with the value {array[index]:g} at index {_index(index)}, but {where} goes {bounds}"
+        low, high, value = space.low[index], space.high[index], array[index]
+        shown = f"{value:g}" if f"{value:g}" not in (f"{low:g}", f"{high:g}") else str(value)  # such as 1.0000001
+        yield (
+            "warning",
+            (f"{what} with the value {shown} at index {_index(index)}, but {where} goes from {low:g} to {high:g}"),
+        )
 
 
 def _first(mask: np.ndarray) -> tuple[int, ...]:

@@ -80,6 +80,9 @@ def test_what_does_not_stop_training_is_a_warning_given_once() -> None:
         "but observation_space goes from -1 to 1 (after 1 env_steps)",
     )
     assert not report.problems
+    space, above = Box(0.0, 1.0, (1,)), np.array([np.nextafter(np.float32(1.0), np.float32(2.0))])
+    ((_, text),) = observation_violations(space, above, "step")
+    assert "the value 1.0000001 at index 0, but observation_space goes from 0 to 1" in text, "not 1 beyond 1"
     (flag,) = check("flag").warnings
     assert "step returns terminated=0, of type int: it must be a bool" in flag
 
@@ -417,6 +420,40 @@ def test_several_images_in_one_array_are_noted(
     assert bool(found) is noted
     chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update={"encoder": "mlp"})})
     assert not stacked_images(report, chosen)
+
+
+@pytest.mark.parametrize(
+    ("shape", "settings", "text"),
+    [
+        (
+            (160, 120, 3),
+            {"grey": True, "resize": (84, 84)},
+            "is made grey and 84 x 84 pixels small for the policy: if colours matter, use --set "
+            "environment.grey=false; if small details matter, --set environment.resize=[HEIGHT,WIDTH]",
+        ),
+        ((160, 120, 1), {"resize": (84, 84)}, "is made 84 x 84 pixels small for the policy: if small details matter"),
+        ((84, 84, 1), {"resize": (84, 84)}, ""),  # the user's own transforms are in the spaces
+        ((160, 120, 3), {}, ""),
+    ],
+)
+def test_what_default_settings_remove_from_images_is_noted(
+    shape: tuple[int, ...], settings: dict[str, object], text: str
+) -> None:
+    report = EnvironmentReport(spaces=plain_spaces(ArraySpace(shape=shape, dtype="uint8"), 2))
+    chosen = spec().model_copy(update={"environment": spec().environment.model_copy(update=settings)})
+    notes = advice(report, chosen, processors=2)
+    assert [text in note for note in notes] == ([True] if text else [])
+
+
+@pytest.mark.parametrize(
+    ("shape", "noted"), [((8, 10, 10), True), ((10, 10, 8), False), ((6, 7, 2), False), ((10, 10, 10), False)]
+)
+def test_map_whose_planes_may_come_first_is_noted(shape: tuple[int, ...], noted: bool) -> None:
+    report = EnvironmentReport(spaces=plain_spaces(ArraySpace(shape=shape, dtype="float32"), 2))
+    chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update={"encoder": "grid"})})
+    notes = advice(report, chosen, processors=2)
+    assert ["8 x 10 cells with 10 planes: if it has 8 planes of 10 x 10" in note for note in notes] == [True] * noted
+    assert not advice(report, spec(), processors=2)
 
 
 @pytest.mark.parametrize(
