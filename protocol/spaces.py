@@ -75,7 +75,7 @@ class StillObservations:
             return ""
         return (
             f"observation component {still[0]!r} is the same in all {self._compared:,} rows and {episodes:,} episodes "
-            f"so far: look at the sensor or camera that it comes from, or leave it out (environment.leave_out)"
+            "so far: if it should have changed by now, look at the sensor or camera that it comes from"
         )
 
 

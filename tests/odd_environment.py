@@ -46,6 +46,26 @@ class Odd(gymnasium.Env[Any, Any]):
             raise ConnectionError("already disconnected")
 
 
+class Drawn(Odd):
+    """Odd, whose rewards are drawn by its constructor, or in `reset`."""
+
+    def __init__(self, drawn_by: str) -> None:
+        super().__init__()
+        self._drawn_by, self._reward = drawn_by, np.random.default_rng().random()
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        result = super().reset(seed=seed)
+        if self._drawn_by == "seed":
+            self._reward = self.np_random.random()
+        elif self._drawn_by == "reset":
+            self._reward = np.random.default_rng().random()
+        return result
+
+    def step(self, action: Any) -> Any:
+        observation, _, *rest = super().step(action)
+        return observation, self._reward, *rest
+
+
 class Popping(Odd):
     """Odd, whose constructor takes its options out of a map."""
 

@@ -6,7 +6,7 @@ import importlib
 import re
 import time
 import warnings
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 import gymnasium
@@ -16,8 +16,8 @@ from gymnasium.utils.env_checker import check_env
 from daedalus.actor.environments.bots import RandomActions
 from daedalus.actor.environments.components import is_text, leaves
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
-from daedalus.actor.environments.gymnasium_backend import registration
-from daedalus.actor.environments.info import MASK_KEY, mask_of_one
+from daedalus.actor.environments.gymnasium_backend import make_single, registration
+from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
@@ -108,6 +108,66 @@ def minigrid_codes(environment: gymnasium.Env, space: gymnasium.Space, seed: int
 
 def _shown(text: str) -> str:
     return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+
+
+_FIRST_STEPS = 20  # of an episode, which two environments with one seed play
+
+
+def own_task(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str:
+    """Return a warning if the seed of an environment does not decide what it plays, but its constructor does.
+
+    Two environments with one seed then play differently, though each repeats its own episode. gymnasium's checker sees
+    only the latter. Returns an empty string also if that cannot be known within about twice `seconds`.
+
+    Args:
+      spec: the environment and its transforms, without texts in its observations.
+      modules: the modules that may be imported for it.
+      seconds: for the first environment.
+    """
+    until, played = time.monotonic() + seconds, list[list[np.ndarray]]()
+    with suppress(Exception, SystemExit):  # of the user's code; playing reports it
+        for episodes in (2, 1):
+            environment = make_single(spec, modules)
+            if environment is None:
+                return ""
+            with closing(environment):
+                for _ in range(episodes):
+                    if time.monotonic() > until:
+                        return ""
+                    played.append(_first_rows(environment, spec))
+            if not _alike(played[0], played[1]):
+                return ""  # gymnasium's checker says so
+            until = np.inf
+        if not _alike(played[0], played[2]):
+            return (
+                f"environment {spec.id}: two of them with the same seed play differently, though each repeats its own "
+                "episode: its constructor draws what the seed does not decide, so that every environment of training "
+                "and of evaluations has a task of its own; draw it in reset, from self.np_random"
+            )
+    return ""
+
+
+def _first_rows(environment: gymnasium.Env, spec: EnvironmentSpec) -> list[np.ndarray]:
+    """Return the observations, rewards and ends of the first steps of an episode."""
+    observation, info = environment.reset(seed=0)
+    mask = info.get(MASK_KEY) if has_choices(environment.action_space, spec) else None
+    example = None if mask is None else mask_of_one(mask)
+    transforms = Transforms(spec, environment.observation_space, environment.action_space, example)
+    random, rows, over = RandomActions(transforms.spaces.actions, 0), list[np.ndarray](), False
+    for _ in range(_FIRST_STEPS):
+        observed = transforms.observe_one(observation, info.get(MASK_KEY), needed=not over)
+        rows.extend(observed.frames.values())
+        if over:
+            break
+        action = transforms.env_action(random.choose(observed.masks))
+        observation, reward, terminated, truncated, info = environment.step(action)
+        over = bool(terminated or truncated)
+        rows.append(np.array([float(reward), over]))
+    return rows
+
+
+def _alike(rows: list[np.ndarray], others: list[np.ndarray]) -> bool:
+    return all(np.allclose(row, other, rtol=1e-3, atol=1e-6) for row, other in zip(rows, others, strict=False))
 
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m|^WARN: ")

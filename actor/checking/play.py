@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import Texts, minigrid_codes
+from daedalus.actor.checking.checker import Texts, minigrid_codes, own_task
 from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
@@ -103,6 +103,7 @@ def _check_spaces(environment: gymnasium.Env, name: str) -> None:
 
 
 _COUNT, _STEPS, _SECONDS = 2, 50, 1.0  # few: one environment was played before
+_SLOW_START = 2.0  # seconds to make an environment, with the imports
 
 
 def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spaces, seed: int) -> str:
@@ -216,13 +217,17 @@ def check_environment(
     """
     if spec.is_game:
         return check_game(spec, modules, seconds=seconds, env_steps=env_steps, seed=seed, bots=bots)
+    began = time.monotonic()
     report = _check_one(spec, modules, seconds, env_steps, seed)
+    is_slow = time.monotonic() - began > seconds + _SLOW_START  # to make a second one could take as long
     if report.problems or report.spaces is None or seconds == 0.0:
         return report
     left_out = spec.model_copy(update={"leave_out": (*spec.leave_out, *report.constant_texts)})
     problem = vectorized_problem(left_out, modules, report.spaces, seed) or _evaluated_problem(spec, modules, report)
     if problem:
         return report.model_copy(update={"problems": (problem,)})
+    if spec.backend == "gymnasium" and not is_slow and (warning := own_task(left_out, modules, seconds / 3)):
+        report = report.model_copy(update={"warnings": (*report.warnings, warning)})
     return report.model_copy(update={"vectorized": uses_vector_entry_point(spec, modules)})
 
 

@@ -169,7 +169,7 @@ def test_observations_that_stand_still_are_a_warning(monkeypatch: pytest.MonkeyP
     assert warned(50) == []  # too early
     assert warned(100, "joint") == warned(100, "camera", "joint") == []  # the camera may show the goal of the episode
     (camera,) = warned(100, "joint", stopped=True)
-    assert camera.startswith("observation component 'camera' is the same in all 95 rows and 5 episodes so far: look at")
+    assert camera.startswith("observation component 'camera' is the same in all 95 rows and 5 episodes so far: if it ")
     assert warned(50, "joint", stopped=True) == warned(55, "joint", stopped=True) == []
 
 

@@ -109,6 +109,14 @@ def test_component_without_a_fixed_shape_can_be_left_out(processes: bool) -> Non
         assert environments.step({"action": np.array([[0], [1]])})[1].tolist() == [1.0, 1.0]
 
 
+@pytest.mark.parametrize(("drawn_by", "warns"), [("constructor", True), ("seed", False), ("reset", False)])
+def test_task_that_the_constructor_draws_is_a_warning(drawn_by: str, warns: bool) -> None:
+    """Each environment of a run would have a task of its own, whatever the seed."""
+    report = check_environment(spec("Drawn", drawn_by=drawn_by), MODULES, seconds=60.0, env_steps=10)
+    assert report.problems == ()
+    assert ["draw it in reset, from self.np_random" in warning for warning in report.warnings] == [True] * warns
+
+
 def test_environments_do_not_share_what_their_constructor_changes_in_place() -> None:
     given = {"options": {"masks": "lists"}}
     checked = spec("Popping", **given)
