@@ -155,7 +155,10 @@ def _first_rows(environment: gymnasium.Env, spec: EnvironmentSpec) -> list[np.nd
     transforms = Transforms(spec, environment.observation_space, environment.action_space, example)
     random, rows, over = RandomActions(transforms.spaces.actions, 0), list[np.ndarray](), False
     for _ in range(_FIRST_STEPS):
-        observed = transforms.observe_one(observation, info.get(MASK_KEY), needed=not over)
+        try:
+            observed = transforms.observe_one(observation, info.get(MASK_KEY), needed=not over)
+        except ValueError:  # such as a mask without a legal choice
+            break
         rows.extend(observed.frames.values())
         if over:
             break

@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
@@ -25,7 +26,7 @@ from daedalus.actor.checking.violations import (
 from daedalus.actor.environments.bots import RandomActions
 from daedalus.actor.environments.components import batch_of_one, only_of_batch, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.gymnasium_backend import make_single, uses_vector_entry_point
+from daedalus.actor.environments.gymnasium_backend import make_single, registration, uses_vector_entry_point
 from daedalus.actor.environments.gymnasium_environments import limited_close
 from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks
 from daedalus.actor.environments.make import make_bare
@@ -103,7 +104,7 @@ def _check_spaces(environment: gymnasium.Env, name: str) -> None:
 
 
 _COUNT, _STEPS, _SECONDS = 2, 50, 1.0  # few: one environment was played before
-_SLOW_START = 2.0  # seconds to make an environment, with the imports
+_SLOW_START = 1.0  # seconds to make an environment
 
 
 def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spaces, seed: int) -> str:
@@ -217,9 +218,10 @@ def check_environment(
     """
     if spec.is_game:
         return check_game(spec, modules, seconds=seconds, env_steps=env_steps, seed=seed, bots=bots)
+    _import_first(spec, modules)
     began = time.monotonic()
     report = _check_one(spec, modules, seconds, env_steps, seed)
-    is_slow = time.monotonic() - began > seconds + _SLOW_START  # to make a second one could take as long
+    is_slow = time.monotonic() - began > 2.0 * seconds + _SLOW_START  # to make a second one could take as long
     if report.problems or report.spaces is None or seconds == 0.0:
         return report
     left_out = spec.model_copy(update={"leave_out": (*spec.leave_out, *report.constant_texts)})
@@ -229,6 +231,16 @@ def check_environment(
     if spec.backend == "gymnasium" and not is_slow and (warning := own_task(left_out, modules, seconds / 3)):
         report = report.model_copy(update={"warnings": (*report.warnings, warning)})
     return report.model_copy(update={"vectorized": uses_vector_entry_point(spec, modules)})
+
+
+def _import_first(spec: EnvironmentSpec, modules: UserModules) -> None:
+    """Import what makes the environment, so that the time to make it is known. Making it reports errors."""
+    if spec.backend == "gymnasium":
+        with suppress(Exception, SystemExit):  # of the user's code
+            modules.check(spec.user_modules)
+            entry_point = registration(spec.id, modules).entry_point
+            if isinstance(entry_point, str):
+                load_env_creator(entry_point)
 
 
 def _evaluated_problem(spec: EnvironmentSpec, modules: UserModules, trained: EnvironmentReport) -> str:
