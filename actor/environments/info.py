@@ -8,7 +8,8 @@ Environments say which actions are legal by one of the conventions that exist:
   component. The policy then does not observe it.
 """
 
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import gymnasium
@@ -22,6 +23,34 @@ from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER, MAX_INFO_NAMES, MAX_INFO_VALUES
 
 MASK_KEY = "action_mask"
+
+
+_NAME_OF_A_MASK = re.compile("mask|legal|valid|avail|allowed|feasible", re.IGNORECASE)
+
+
+def unread_mask(values: Mapping[Any, Any], choices: int) -> str:
+    """Return the name of an entry that seems to say which choices are legal, but is not read; empty if there is none.
+
+    Args:
+      values: `info` of one environment, or components of its observation.
+      choices: number of choices of the action.
+    """
+    for name, value in values.items():
+        if name == MASK_KEY or not isinstance(name, str) or not _NAME_OF_A_MASK.search(name):
+            continue
+        if not isinstance(value, np.ndarray | list | tuple | set | frozenset):
+            continue
+        try:
+            array = np.asarray(value if isinstance(value, np.ndarray) else list(value))
+        except ValueError:  # lists of different lengths
+            continue
+        if array.dtype.kind not in "biuf" or not array.size:
+            continue
+        flags = array.size == choices and bool(np.isin(array, (0, 1)).all())
+        numbers = array.dtype.kind in "iu" and array.ndim == 1 and len(np.unique(array)) == array.size <= choices
+        if flags or (numbers and array.min() >= 0 and array.max() < choices):
+            return name
+    return ""
 
 
 def has_choices(action_space: gymnasium.Space, spec: EnvironmentSpec) -> bool:

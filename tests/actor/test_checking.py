@@ -173,6 +173,38 @@ def test_observations_that_stand_still_are_a_warning(monkeypatch: pytest.MonkeyP
     assert warned(50, "joint", stopped=True) == warned(55, "joint", stopped=True) == []
 
 
+@pytest.mark.parametrize(
+    ("shown", "warns"),
+    [
+        ({"legal_moves": [2, 0]}, True),
+        ({"legal_moves": {1}}, True),
+        ({"valid_actions": np.array([True, False, True])}, True),
+        ({"avail_actions": [0, 1, 1]}, True),
+        ({"action_mask": np.array([1, 0, 1], np.int8), "valid": [1, 1, 1]}, False),
+        ({"valid_moves": 2, "is_legal": True, "legal": [[1], [0, 2]], "valid": [0.5, 1.0, 0.0], "mask": "101"}, False),
+        ({"legal_moves": [3]}, False),  # of another thing than the three choices
+        ({"scores": [0, 1, 1]}, False),
+    ],
+)
+def test_mask_under_a_name_that_is_not_read_is_a_warning(
+    shown: dict[str, Any], warns: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Board(Sensors):
+        action_space = Discrete(3)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return super().reset(seed=seed)[0], shown
+
+        def step(self, action: Any) -> Any:
+            return *super().step(action)[:4], shown
+
+    monkeypatch.setitem(gymnasium.registry, "Board-v0", EnvSpec("Board-v0", entry_point=Board))
+    spec = EnvironmentSpec(id="Board-v0", kwargs={"changes": ["joint"], "stopped": False})
+    report = check_environment(spec, UserModules(), seconds=60.0, env_steps=20)
+    assert report.problems == ()
+    assert ["which of the 3 choices are legal" in warning for warning in report.warnings] == [True] * warns
+
+
 def test_without_play_only_the_spaces_are_read() -> None:
     report = check("nan", seconds=0.0)
     assert report.spaces is not None
