@@ -42,7 +42,8 @@ class StillObservations:
     """What of the observations has not changed so far: all of a game that draws nothing, a camera that stands still."""
 
     def __init__(self) -> None:
-        self._changed: dict[str, bool] = {}  # by component: at all, also from one episode to the next
+        # By component: at all, also from one episode, environment or agent to the next.
+        self._changed: dict[str, bool] = {}
         self._moves = False  # whether anything changed within an episode
         self._compared = 0  # rows that go on
 
@@ -57,7 +58,9 @@ class StillObservations:
         for name, rows in frames.items():
             if not (self._moves and self._changed.get(name, False)):
                 differs = (rows[1:] != rows[:-1]).reshape(*goes_on.shape, -1).any(2)
-                self._changed[name] = self._changed.get(name, False) or bool(differs.any())
+                self._changed[name] = self._changed.get(name, False) or bool(
+                    differs.any() or (rows[0] != rows[0, :1]).any()
+                )
                 self._moves |= bool((differs & goes_on).any())
 
     def text(self, episodes: int) -> str:

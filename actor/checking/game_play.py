@@ -21,6 +21,7 @@ from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
+_FEWEST_TOGETHER = 50  # steps of several agents after which equal observations are no chance
 _LOOKED_AT = 200  # steps whose observations are compared with their space: it takes longer than most steps
 
 
@@ -73,6 +74,7 @@ def _played(
     before, still = {name: frames.copy() for name, frames in observed.frames.items()}, StillObservations()
     reset_seconds, busy = time.monotonic() - began, 0.0
     lengths, returns, steps, length, total = [], [], 0, 0, np.zeros(games.count)
+    together, differ = 0, False  # steps in which several agents act, and whether what they observe ever differs
     until, stepping = time.monotonic() + seconds, 0.0
     while not steps or (steps < env_steps and time.monotonic() < until):
         rows = [
@@ -90,6 +92,10 @@ def _played(
         goes_on = observed.acting & ~(terminated | truncated) & (length > 0)  # no step that only resets
         still.add({name: np.stack([frames, observed.frames[name]]) for name, frames in before.items()}, goes_on[None])
         before = {name: frames.copy() for name, frames in observed.frames.items()}
+        seats = np.flatnonzero(observed.acting)
+        if len(seats) > 1 and not differ:
+            together += 1
+            differ = any((frames[seats] != frames[seats[0]]).any() for frames in observed.frames.values())
         if steps <= _LOOKED_AT:
             for seat, row in enumerate(iterate(batch, games.observations)):
                 if observed.acting[seat]:
@@ -103,6 +109,12 @@ def _played(
             length, total = -1, np.zeros(games.count)  # the next step only resets
     if text := still.text(len(lengths)):
         warnings["still"] = f"environment {spec.id}: {text}"
+    if together >= _FEWEST_TOGETHER and not differ:
+        warnings["alike"] = (
+            f"environment {spec.id}: all agents that act observe the same in all of {together:,} rows, so that one "
+            "policy cannot know which of them it plays: let it observe that (--set environment.agent_ids=true), unless "
+            "they are to do the same"
+        )
     return {
         "warnings": tuple(warnings.values()),
         "env_steps": steps,

@@ -440,6 +440,27 @@ def test_a_game_whose_observations_stand_still_is_a_warning() -> None:
     assert warnings("pettingzoo.classic.tictactoe_v3") == ()
 
 
+class Board(Duel):
+    """Both agents see how many steps are left; with `own`, also which agent sees it."""
+
+    def __init__(self, own: bool = False) -> None:
+        super().__init__("free")
+        self.own = own
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        return {
+            agent: np.array([self.left / 5, self.own and agent == "red"], np.float32) for agent in self.possible_agents
+        }
+
+
+@pytest.mark.parametrize("fields", [{}, {"kwargs": {"own": True}}, {"agent_ids": True}, {"agents": ("red",)}])
+def test_agents_that_always_observe_the_same_are_a_warning(fields: dict[str, Any]) -> None:
+    spec = EnvironmentSpec(id="test_games:Board", backend="pettingzoo", **fields)
+    report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=80)
+    # Nor is it one that the number of the agent, which differs between the agents, never changes for one of them.
+    assert ["--set environment.agent_ids=true" in warning for warning in report.warnings] == [True] * (not fields)
+
+
 def dark(render_mode: str) -> Duel:
     return Duel()
 
