@@ -10,6 +10,7 @@ _SLOW_SECONDS = 0.005  # a step of a few milliseconds costs more than the exchan
 _WIDE = 1e6  # from bound to bound of an action: the policy explores a hundredth of it to the end
 _SMALL_PIXEL = 16  # an image without a larger value is rather a map of numbers, such as the kinds of things in a grid
 _DEAR_SECONDS = 0.02  # a step of so long costs more than several updates of a small network
+_FEWEST_EPISODES = 10  # whose equal lengths are no chance
 _BUSY = 0.2  # share of processor time below which a step mostly waits, even on a busy machine
 
 
@@ -34,6 +35,7 @@ class EnvironmentReport(Specification):
     codes: dict[str, tuple[int, ...]] = Field(default_factory=dict)  # of components that are codes, as policy.codes
     lengths: tuple[int, ...] = ()  # of the episodes that ended
     returns: tuple[float, ...] = ()
+    truncations: int = 0  # of the episodes that ended, those that were truncated
 
     def text_problem(self, spec: RunSpec) -> str:
         """Return the problem of a run whose settings do not leave out a text, or an empty string."""
@@ -56,6 +58,7 @@ def advice(report: EnvironmentReport, spec: RunSpec, processors: int) -> list[st
         planes_first(report, spec),
         small_bytes(report, spec),
         uninformative_bounds(report),
+        terminated_by_time(report, spec),
         replay_instead(report, spec),
     )
     return [text for text in texts if text]
@@ -223,6 +226,20 @@ def replay_instead(report: EnvironmentReport, spec: RunSpec) -> str:
     return (
         f"a step takes {_duration(report.step_seconds)}: training.algorithm=sac (--algorithm sac) learns from each "
         f"step many times, and so needs far fewer of them than {spec.training.algorithm}"
+    )
+
+
+def terminated_by_time(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if all episodes terminated after equally many steps, as by a limit of time, else nothing."""
+    lengths = report.lengths
+    if len(lengths) < _FEWEST_EPISODES or len(set(lengths)) > 1 or lengths[0] == 1:
+        return ""
+    if report.truncations or spec.environment.bootstrap_terminations or spec.environment.is_game:
+        return ""
+    return (
+        f"all {len(lengths):,} episodes terminated after {lengths[0]} env_steps: if that is a limit of time, which the "
+        "observation does not show, return truncated in place of terminated, or use "
+        "--set environment.bootstrap_terminations=true"
     )
 
 

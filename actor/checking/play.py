@@ -334,6 +334,7 @@ class _Play:
         self._env_steps, self._resets = 0, 0
         self._step_seconds, self._busy_seconds, self._reset_seconds = 0.0, 0.0, 0.0
         self._lengths: list[int] = []
+        self._truncations = 0
         self._returns: list[float] = []
 
     def run(self, seconds: float, env_steps: int, seed: int) -> None:
@@ -371,6 +372,7 @@ class _Play:
             byte_maxima={name: tuple(map(int, each)) for name, each in self._byte_maxima.items() if self._env_steps},
             lengths=tuple(self._lengths),
             returns=tuple(self._returns),
+            truncations=self._truncations,
         )
 
     def _reset(self, seed: int | None) -> None:
@@ -400,6 +402,7 @@ class _Play:
         self._add(learned_reward_violations(float(reward), self._spec))
         self._precision.add_reward(reward)
         over = bool(terminated or truncated)
+        self._truncations += bool(truncated)
         self._observe(observation, info, over=over)
         return float(reward), over
 

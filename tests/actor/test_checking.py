@@ -423,6 +423,31 @@ def test_an_environment_without_an_end_is_noted() -> None:
 
 
 @pytest.mark.parametrize(
+    ("found", "settings", "noted"),
+    [
+        ({"lengths": (30,) * 10}, {}, True),
+        ({"lengths": (30,) * 9}, {}, False),
+        ({"lengths": (30, 30, 12) * 4}, {}, False),
+        ({"lengths": (30,) * 10, "truncations": 5}, {}, False),
+        ({"lengths": (1,) * 12}, {}, False),
+        ({"lengths": (30,) * 10}, {"bootstrap_terminations": True}, False),
+    ],
+)
+def test_terminations_as_by_a_time_limit_are_noted(
+    found: dict[str, Any], settings: dict[str, bool], noted: bool
+) -> None:
+    chosen = spec().model_copy(update={"environment": spec().environment.model_copy(update=settings)})
+    notes = advice(EnvironmentReport(**found), chosen, processors=2)
+    assert ["return truncated in place of terminated" in note for note in notes] == [True] * noted
+
+
+def test_truncations_are_counted() -> None:
+    for limit, truncations in ((3, 8), (None, 0)):
+        report = check(max_episode_steps=limit)
+        assert report.truncations == truncations, "episodes of Faulty terminate after 10 steps; 25 are played"
+
+
+@pytest.mark.parametrize(
     ("shape", "dtype", "noted"),
     [
         ((3, 40, 40), "float32", True),
