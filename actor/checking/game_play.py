@@ -74,7 +74,7 @@ def _played(
     before, still = {name: frames.copy() for name, frames in observed.frames.items()}, StillObservations()
     reset_seconds, busy = time.monotonic() - began, 0.0
     lengths, returns, steps, length, total = [], [], 0, 0, np.zeros(games.count)
-    together, differ = 0, False  # steps in which several agents act, and whether what they observe ever differs
+    together, differ = 0, False  # steps that show several agents something new; whether they ever observe another
     until, stepping = time.monotonic() + seconds, 0.0
     while not steps or (steps < env_steps and time.monotonic() < until):
         rows = [
@@ -91,11 +91,11 @@ def _played(
         _refuse_unfit(games, observed.frames, rewards)
         goes_on = observed.acting & ~(terminated | truncated) & (length > 0)  # no step that only resets
         still.add({name: np.stack([frames, observed.frames[name]]) for name, frames in before.items()}, goes_on[None])
-        before = {name: frames.copy() for name, frames in observed.frames.items()}
         seats = np.flatnonzero(observed.acting)
         if len(seats) > 1 and not differ:
-            together += 1
+            together += any((frames != before[name]).any() for name, frames in observed.frames.items())
             differ = any((frames[seats] != frames[seats[0]]).any() for frames in observed.frames.values())
+        before = {name: frames.copy() for name, frames in observed.frames.items()}
         if steps <= _LOOKED_AT:
             for seat, row in enumerate(iterate(batch, games.observations)):
                 if observed.acting[seat]:
