@@ -397,7 +397,10 @@ def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None
     for name, codes in found.items():
         shown = ",".join(map(str, codes))
         _logger.info("observation component %r has codes: by default policy.codes.%s=[%s]", name, name, shown)
-    return report.spaces, default_settings(report.spaces, leave_out, report.seats, found)
+    maps = report.maps if spec.policy.encoder == "auto" else ()
+    for name in maps:
+        _logger.info("observation component %r is a map of a few cells: by default policy.encoder=grid", name)
+    return report.spaces, default_settings(report.spaces, leave_out, report.seats, found, maps)
 
 
 def quick_check(

@@ -33,6 +33,7 @@ class EnvironmentReport(Specification):
     # Largest values seen in arrays of bytes, by component: in each place of the last axis, or in all places.
     byte_maxima: dict[str, tuple[int, ...]] = Field(default_factory=dict)
     codes: dict[str, tuple[int, ...]] = Field(default_factory=dict)  # of components that are codes, as policy.codes
+    maps: tuple[str, ...] = ()  # components that are maps of a few cells, with planes of 0 and 1
     lengths: tuple[int, ...] = ()  # of the episodes that ended
     returns: tuple[float, ...] = ()
     truncations: int = 0  # of the episodes that ended, those that were truncated
@@ -154,9 +155,9 @@ def planes_first(report: EnvironmentReport, spec: RunSpec) -> str:
     if spec.policy.encoder != "grid" or report.spaces is None:
         return ""
     for name, space in report.spaces.observations.items():
-        if isinstance(space, ArraySpace) and len(space.shape) == 3 and space.shape[0] != space.shape[1]:
+        if isinstance(space, ArraySpace) and len(space.shape) == 3:
             height, width, planes = space.shape
-            if width == planes:
+            if height != width == planes:
                 return (
                     f"policy.encoder=grid reads {name!r} as {height} x {width} cells with {planes} planes: if it has "
                     f"{height} planes of {width} x {planes} cells, put the planes last in a wrapper (--wrap)"

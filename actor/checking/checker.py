@@ -106,6 +106,27 @@ def minigrid_codes(environment: gymnasium.Env, space: gymnasium.Space, seed: int
     return {}
 
 
+_SMALLEST_MAP, _LARGEST_MAP = 8, 32  # cells of a side
+
+
+def square_maps(space: gymnasium.Space) -> tuple[str, ...]:
+    """Return the components that are maps (height, width, planes) of a few cells by their space: square, of 0 and 1."""
+    return tuple(
+        leaf.name
+        for leaf in leaves(space, "observation")
+        if isinstance(leaf.space, gymnasium.spaces.Box | gymnasium.spaces.MultiBinary)
+        and len(shape := leaf.space.shape or ()) == 3
+        and _SMALLEST_MAP <= shape[0] == shape[1] <= _LARGEST_MAP
+        and (leaf.space.dtype == np.bool_ or _is_binary(leaf.space))
+    )
+
+
+def _is_binary(space: gymnasium.Space) -> bool:
+    if isinstance(space, gymnasium.spaces.Box):
+        return space.dtype.kind in "iu" and bool((space.low == 0).all() and (space.high == 1).all())
+    return True  # MultiBinary
+
+
 def _shown(text: str) -> str:
     return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
 

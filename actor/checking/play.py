@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import Texts, minigrid_codes, own_task
+from daedalus.actor.checking.checker import Texts, minigrid_codes, own_task, square_maps
 from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
@@ -281,7 +281,7 @@ def _check_one(
         for name, maxima in report.byte_maxima.items():
             if name in codes and not all(map(operator.lt, maxima, codes[name])):
                 del codes[name]  # a wrapper has written other numbers into some of them
-        return report.model_copy(update={"codes": codes})
+        return report.model_copy(update={"codes": codes, "maps": () if altered else square_maps(space)})
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     finally:

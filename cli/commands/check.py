@@ -95,7 +95,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
     processes = ""
     if choice.env is not None:
         leave_out = [*environment.leave_out, *report.constant_texts]
-        defaults = default_settings(report.spaces, leave_out, report.seats, report.codes)
+        defaults = default_settings(report.spaces, leave_out, report.seats, report.codes, report.maps)
         defaults, processes = with_measured_processes(choice.spec, defaults, report)
         spec = choice.spec(defaults)
         if spec.environment != environment and report.spaces is not None:

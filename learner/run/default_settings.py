@@ -24,6 +24,7 @@ def default_settings(
     leave_out: Sequence[str] = (),
     seats: int = 1,
     codes: Mapping[str, tuple[int, ...]] = MappingProxyType({}),
+    maps: Collection[str] = (),
 ) -> dict[str, Any]:
     """Return the default settings for the spaces of an environment, as a preset has them.
 
@@ -32,6 +33,7 @@ def default_settings(
       leave_out: components of the observation that are not in `spaces`.
       seats: agents of a game that the policy plays: each has rows of its own.
       codes: components of the observation that are codes, as `policy.codes` has them.
+      maps: components of the observation that are maps of a few cells.
     """
     kind = _UNKNOWN if spaces is None else kind_of(spaces, codes)
     file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
@@ -42,6 +44,8 @@ def default_settings(
         # The bonus would widen a Gaussian for nothing: noise beyond the bounds is clipped (docs/results.md).
         settings["training"]["entropy_bonus"] = 0.0
         settings["training"].pop("entropy_bonus_final", None)
+    if kind == "vectors_discrete" and maps:
+        settings["policy"]["encoder"] = "grid"
     if kind == "vectors_continuous" and spaces is not None:
         settings["policy"]["initial_std"] = round(settings["policy"]["initial_std"] * _noise_scale(spaces), 2)
     for section, values in settings.pop("for_two_seats", {}).items():

@@ -22,7 +22,7 @@ from daedalus.actor.checking.check_report import (
     stacked_images,
     uninformative_bounds,
 )
-from daedalus.actor.checking.checker import gymnasium_notes
+from daedalus.actor.checking.checker import gymnasium_notes, square_maps
 from daedalus.actor.checking.play import check_environment, unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
 from daedalus.actor.environments.precision import Precision
@@ -30,6 +30,7 @@ from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
+BOOL: Any = np.bool_  # as MinAtar has it, though Box is not typed for it
 FAULTY = "faulty_environments:Faulty-v0"
 MODULES = UserModules(frozenset({"faulty_environments"}))
 
@@ -210,6 +211,25 @@ def test_mask_under_a_name_that_is_not_read_is_a_warning(
     report = check_environment(spec, UserModules(), seconds=60.0, env_steps=20)
     assert report.problems == ()
     assert ["which of the 3 choices are legal" in warning for warning in report.warnings] == [True] * warns
+
+
+@pytest.mark.parametrize(
+    ("space", "is_map"),
+    [
+        (Box(0, 1, (10, 10, 4), BOOL), True),
+        (Box(0, 1, (8, 8, 2), np.int8), True),
+        (MultiBinary((10, 10, 4)), True),
+        (Box(0.0, 1.0, (10, 10, 4)), False),  # any numbers
+        (Box(0, 255, (10, 10, 4), np.uint8), False),
+        (Box(0, 1, (10, 12, 4), BOOL), False),
+        (Box(0, 1, (6, 6, 4), BOOL), False),
+        (Box(0, 1, (64, 64, 4), BOOL), False),
+        (Box(0, 1, (10, 10), BOOL), False),
+    ],
+)
+def test_small_boards_of_flags_are_maps(space: gymnasium.Space, is_map: bool) -> None:
+    assert square_maps(space) == ("observation",) * is_map
+    assert square_maps(Dict(board=space, turn=Discrete(2))) == ("board",) * is_map
 
 
 def test_without_play_only_the_spaces_are_read() -> None:

@@ -152,6 +152,13 @@ def test_rollouts_of_many_seats_are_no_larger(where: Spaces, seats: int, rows: i
     assert settings["training"].get("mean_first_value", False) == (seats > 2)
 
 
+def test_maps_are_convolved_where_actions_are_choices() -> None:
+    board = ArraySpace(shape=(10, 10, 4), dtype="float32")
+    assert default_settings(spaces(CHOICES, board), maps=["observation"])["policy"]["encoder"] == "grid"
+    for where, maps in ((spaces(CHOICES, board), []), (spaces(JOINTS, board), ["observation"])):
+        assert "encoder" not in default_settings(where, maps=maps)["policy"]
+
+
 def test_components_to_leave_out_become_a_setting() -> None:
     assert default_settings(spaces(CHOICES, VECTOR), ["mission"])["environment"]["leave_out"] == ["mission"]
     assert "environment" not in default_settings(spaces(CHOICES, VECTOR))
