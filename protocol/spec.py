@@ -355,7 +355,7 @@ class TrainingSpec(LossSpec):
     evaluations (`environment.training_kwargs`, `environment.no_reward_limit`, `[lessons]`), only then. `daedalus
     train` confirms it with as many new episodes."""
     target_episodes: PositiveInt = 100
-    """Number of newest training episodes in the mean return; in a game those of its agents, of which a match has several."""
+    """Number of newest training episodes in the mean return. In a game, those of its agents: several in each match."""
     stop_when_solved: bool = True
     """Stop when the target is reached: `target_return`, or that of `[league]`. Otherwise use the whole budget."""
 
