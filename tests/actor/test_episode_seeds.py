@@ -84,7 +84,7 @@ def test_envpool_returns_the_same() -> None:
 def test_ale_returns_the_same() -> None:
     pytest.importorskip("ale_py")
     spec = EnvironmentSpec(
-        id="Breakout", backend="ale", grey=True, action_repeat=4, resize=(42, 42), max_episode_steps=1200
+        id="Breakout", backend="ale", grey=True, action_repeat=4, resize=(42, 42), max_episode_steps=800
     )
     assert_same([played(spec, count, episodes=6, encoder="small") for count in (1, 3)], differing=2)
 
