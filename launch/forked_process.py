@@ -21,14 +21,14 @@ from daedalus.launch.process_lifecycle import interrupts_held
 
 _POLL_SECONDS = 0.01
 _TEXT: dict[str, Any] = {"encoding": "utf-8", "errors": "backslashreplace", "closefd": False, "buffering": 1}
-_ZENOH_THREADS = {"app-0", "net-0"}  # of its runtime, as the system names them
+_ZENOH_THREADS = {"acc-0", "app-0", "net-0"}  # of its runtime; each names itself a moment after its start
 
 
 def why_not_forked() -> str:
     """Return why this process cannot be forked to play, or an empty string."""
     if sys.platform != "linux":  # Apple's frameworks do not work after a fork, and Windows has none
         return f"{sys.platform} cannot fork a program safely"
-    if _ZENOH_THREADS <= _thread_names():
+    if "zenoh" in sys.modules and _ZENOH_THREADS & _thread_names():
         return (
             "this program has opened a Zenoh session, such as that of a daedalus.Client, and a fork could open no other"
         )

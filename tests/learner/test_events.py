@@ -2,11 +2,11 @@
 
 import json
 import logging
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from log_lines import LINES
 
 from daedalus.launch.logs import EVENTS
 from daedalus.learner.serving import events
@@ -29,6 +29,12 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     fake = SimpleNamespace(monotonic=read, time=lambda: 1_800_000_000.25 + clock.now)
     monkeypatch.setattr(events, "time", fake)
     return clock
+
+
+def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return the messages of events in this thread: threads of earlier tests may end, and say so, during this one."""
+    here = threading.get_ident()
+    return [record.getMessage() for record in caplog.records if (record.name, record.thread) == (EVENTS, here)]
 
 
 def texts(log: EventLog) -> list[str]:
@@ -55,17 +61,17 @@ def test_the_filter_of_the_log_knows_the_logger() -> None:
     assert events._logger.name == EVENTS
 
 
-def test_equal_events_of_a_minute_are_one_with_a_count(clock: Clock) -> None:
+def test_equal_events_of_a_minute_are_one_with_a_count(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     log = EventLog()
     for number in range(50):
         log.add("rejected", f"stale: lag {number}", actor="arm", cause="stale")
         log.add("rejected", "unfit", actor="arm", cause="unfit")
     assert [(event.text, event.count) for event in log.report()] == [("stale: lag 0", 50), ("unfit", 50)]
-    assert LINES == ["stale: lag 0", "unfit"]
+    assert lines(caplog) == ["stale: lag 0", "unfit"]
     clock.now += 61.0
     log.add("rejected", "stale: lag 99", actor="arm", cause="stale")
     assert texts(log) == ["stale: lag 0", "unfit", "stale: lag 99"]
-    assert LINES[-1] == "stale: lag 99 (49 more times since the last message)"
+    assert lines(caplog)[-1] == "stale: lag 99 (49 more times since the last message)"
 
 
 def test_last_100_events_are_kept(clock: Clock) -> None:
@@ -76,17 +82,19 @@ def test_last_100_events_are_kept(clock: Clock) -> None:
     assert len(log._equal) == 100
 
 
-def test_events_of_actors_are_rate_limited_and_those_of_the_run_are_not(clock: Clock) -> None:
+def test_events_of_actors_are_rate_limited_and_those_of_the_run_are_not(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
     log = EventLog()
     for number in range(1000):
         log.add("joined", "joined", actor=f"actor-{number}")
     log.add("checkpoint", "saved")
-    assert len(LINES) == 102
-    assert LINES[-2:] == ["900 events of actors were left out: too many at once", "saved"]
+    assert len(lines(caplog)) == 102
+    assert lines(caplog)[-2:] == ["900 events of actors were left out: too many at once", "saved"]
     clock.now += 3.0
     for number in range(10):
         log.add("left", "left", actor=f"actor-{number}")
-    assert LINES[102:] == ["left"] * 3
+    assert lines(caplog)[102:] == ["left"] * 3
 
 
 def test_one_owner_does_not_push_out_the_events_of_others(clock: Clock) -> None:
