@@ -398,9 +398,10 @@ def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None
         shown = ",".join(map(str, codes))
         _logger.info("observation component %r has codes: by default policy.codes.%s=[%s]", name, name, shown)
     maps = report.maps if spec.policy.encoder == "auto" else ()
-    for name in maps:
+    defaults = default_settings(report.spaces, leave_out, report.seats, found, maps)
+    for name in maps if "encoder" in defaults["policy"] else ():  # not with images or continuous actions
         _logger.info("observation component %r is a map of a few cells: by default policy.encoder=grid", name)
-    return report.spaces, default_settings(report.spaces, leave_out, report.seats, found, maps)
+    return report.spaces, defaults
 
 
 def quick_check(

@@ -10,7 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiBinary
 
 
 class Faulty(gymnasium.Env[Any, Any]):
@@ -23,6 +23,10 @@ class Faulty(gymnasium.Env[Any, Any]):
         self._fault, self._never_ends, self._step, self._value = fault, never_ends, 0, value
         if fault == "map":  # of numbers, and no fault
             self.observation_space = Box(0, 255, (20, 20), np.uint8)
+        if fault.endswith("board"):  # no fault
+            self.observation_space = MultiBinary((10, 10, 2))
+        if fault == "driven board":
+            self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         if fault == "three numbers":
             self.observation_space = Box(-1.0, 1.0, (3,), np.float32)
         if fault == "constructor":
@@ -50,6 +54,8 @@ class Faulty(gymnasium.Env[Any, Any]):
             "none": None,
             "map": np.full((20, 20), self._value, np.uint8),
             "three numbers": np.zeros(3, np.float32),
+            "board": np.full((10, 10, 2), self._step % 2, np.int8),
+            "driven board": np.full((10, 10, 2), self._step % 2, np.int8),
         }
         return faulty.get(self._fault, good)
 

@@ -1,4 +1,4 @@
-"""What observations are besides their spaces: texts, codes. And gymnasium's own environment checker."""
+"""What observations are besides their spaces: texts, codes, maps. What a seed decides. And gymnasium's own checker."""
 
 import copy
 import functools

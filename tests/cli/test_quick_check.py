@@ -96,6 +96,14 @@ def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.Monke
     assert "the default settings are those for numbers and discrete actions" in LINES[-1]
 
 
+@pytest.mark.parametrize(("fault", "convolved"), [("board", True), ("driven board", False)])
+def test_a_map_is_convolved_by_default_and_that_is_said(fault: str, convolved: bool) -> None:
+    spaces, defaults = expected_defaults(run(faulty(fault)), MODULES, threading.Event())
+    assert spaces is not None
+    assert (defaults["policy"].get("encoder") == "grid") is convolved
+    assert any("is a map of a few cells: by default policy.encoder=grid" in line for line in LINES) is convolved
+
+
 def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[subprocess.Popen[Any]] = []
 
