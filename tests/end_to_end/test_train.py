@@ -144,7 +144,8 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
     }
     rows = metrics(directory)
     assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
-    assert float(rows[-1]["entropy"]) > 0
+    learned = [float(row["entropy"]) for row in rows if row["entropy"]]  # a row of a stop may come after no update
+    assert min(learned) > 0
 
 
 def test_no_process_and_no_open_port_is_left(solved: tuple[Path, str]) -> None:
