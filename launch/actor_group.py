@@ -76,8 +76,7 @@ class ActorGroup:
                 print_error("actor", error)
                 statuses.append(FAILED)
             finally:
-                stop([actor.process for actor in self._actors])
-                stop([each.process for each in inference])
+                stop([actor.process for actor in self._actors], [each.process for each in inference])
         return max(statuses)
 
     def _tell_to_leave(self) -> None:

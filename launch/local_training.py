@@ -113,9 +113,10 @@ def train(
             return watch(learner, [*actors, *inference, *page], run, stopping)
         finally:
             ask_to_end(learner.process)
-            stop([actor.process for actor in actors])
-            stop([each.process for each in inference])
-            stop([learner.process], LEARNER_GRACE_SECONDS)  # where the disk is slow, it takes longer than the others
+            stop([actor.process for actor in actors], [each.process for each in inference])
+            stop(
+                [learner.process], grace_seconds=LEARNER_GRACE_SECONDS
+            )  # where the disk is slow, it takes longer than the others
 
 
 @contextmanager

@@ -230,7 +230,7 @@ class RoleTraining:
         for learner in learners:
             ask_to_end(learner)
         stop([each.process for each in self._players])
-        stop(learners, LEARNER_GRACE_SECONDS)
+        stop(learners, grace_seconds=LEARNER_GRACE_SECONDS)
         stop([each.process for each in self._routers])
         for each in self._trackers:
             each.finish(stopping)

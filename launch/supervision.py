@@ -327,17 +327,18 @@ def ask_to_end(process: Child) -> None:
         process.stdin.close()
 
 
-def stop(processes: Sequence[Child], grace_seconds: float = _GRACE_SECONDS) -> None:
-    """End processes: ask all, wait, then kill those that are left."""
-    for process in processes:
-        if process.poll() is None:
-            ask_to_end(process)
+def stop(*groups: Sequence[Child], grace_seconds: float = _GRACE_SECONDS) -> None:
+    """End groups of processes in turn: ask all of a group, wait, then kill those that are left. The grace is of all."""
     deadline = time.monotonic() + grace_seconds
-    for process in processes:
-        try:
-            process.wait(max(deadline - time.monotonic(), 0.0))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if process.stdin is not None:
-            process.stdin.close()
+    for processes in groups:
+        for process in processes:
+            if process.poll() is None:
+                ask_to_end(process)
+        for process in processes:
+            try:
+                process.wait(max(deadline - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin is not None:
+                process.stdin.close()

@@ -1,6 +1,7 @@
 """Test of launch/supervision.py: the processes of `daedalus train`."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -105,6 +106,27 @@ def test_the_status_of_a_stopped_learner_is_a_failure_of_another_process() -> No
     with pytest.raises(FailedError, match="worker failed 3 times"):
         message(process)
     stop([process.process])
+
+
+def test_groups_of_processes_that_do_not_end_are_killed_within_one_grace() -> None:
+    waits: list[float | None] = []
+
+    class Recorded(subprocess.Popen[bytes]):
+        def wait(self, timeout: float | None = None) -> int:
+            waits.append(timeout)
+            return super().wait(timeout)
+
+    frozen = [Recorded([sys.executable, "-S", "-c", SLEEP]) for _ in range(2)]
+    for process in frozen:
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+    stop(frozen[:1], frozen[1:], grace_seconds=0.5)
+    assert all(process.returncode < 0 for process in frozen)
+    first, killed, *second = waits
+    assert first is not None
+    assert 0.0 < first <= 0.5
+    assert killed is None
+    assert second == [0.0, None]
 
 
 def test_an_actor_fails_for_the_reason_that_it_prints() -> None:
