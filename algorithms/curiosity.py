@@ -1,7 +1,6 @@
 """Curiosity: a reward for observations that are new in their episode. State; no threads."""
 
 import logging
-import math
 import zlib
 from collections import deque
 from collections.abc import Sequence
@@ -113,12 +112,13 @@ class Curiosity:
         self._rows = self._new = 0  # among the first rows; it has judged them if there are enough
         self._rewards = True
         self._returns = deque[float](maxlen=_EPISODES)  # of the environment, of the newest episodes
-        self._best, self._spread, self._ended = -math.inf, 0.0, 0
+        self._best = torch.zeros(3, dtype=torch.float64)  # 1 once there is one, the best mean return, its deviation
+        self._ended = 0  # episodes since the last look at their mean
 
     @property
     def statistics(self) -> dict[str, Tensor]:
-        """The running scale, for a checkpoint, by name; restored in place."""
-        return self._scale.moments.state()
+        """The running scale and the best mean return, for a checkpoint, by name; restored in place."""
+        return {**self._scale.moments.state(), "best": self._best}
 
     def look(self, rollouts: Sequence[Rollout], weight: float) -> None:
         """Look at the rollouts of a new batch, in order. Their rewards are kept until the next call."""
@@ -159,13 +159,15 @@ class Curiosity:
             self._ended += len(each.episode_returns)
         if self._ended >= _EPISODES:
             self._ended = 0
-            if (mean := float(np.mean(self._returns))) > self._best:
-                self._best, self._spread = mean, float(np.std(self._returns))
+            known, best, _ = self._best.tolist()
+            if (mean := float(np.mean(self._returns))) > best or not known:
+                self._best.copy_(torch.from_numpy(np.array([1.0, mean, np.std(self._returns)])))
 
     def _harmless(self) -> float:
         """Return the part of the reward that is given, from 0 to 1: less the further the mean return has fallen."""
-        drop = self._best - float(np.mean(self._returns)) if len(self._returns) == _EPISODES else 0.0
-        return 1.0 if drop <= 0.0 else max(1.0 - drop / max(_DROP * self._spread, 1e-12), 0.0)
+        known, best, spread = self._best.tolist()
+        drop = best - float(np.mean(self._returns)) if known and len(self._returns) == _EPISODES else 0.0
+        return 1.0 if drop <= 0.0 else max(1.0 - drop / max(_DROP * spread, 1e-12), 0.0)
 
     def _judge(self) -> None:
         """Stop rewarding, after enough rows, if observations do not come back."""

@@ -169,11 +169,11 @@ def test_reward_shrinks_while_the_mean_return_is_below_its_best() -> None:
         lengths = np.ones(len(returns), np.int32)
         return make_rollout(environments=20, rows=20, episode_returns=np.array(returns), episode_lengths=lengths)
 
-    curious = curiosity.Curiosity(DISCOUNT)
+    curious, resumed = curiosity.Curiosity(DISCOUNT), curiosity.Curiosity(DISCOUNT)
 
-    def factor(*returns: float) -> float:
-        curious.look([rollout(*returns)], 1.0)
-        metrics = curious.metrics()
+    def factor(*returns: float, of: curiosity.Curiosity = curious) -> float:
+        of.look([rollout(*returns)], 1.0)
+        metrics = of.metrics()
         return metrics["curiosity_reward_mean"] / metrics["first_visit_fraction"]
 
     at_first = factor(-1.0, 3.0)  # too few episodes
@@ -183,6 +183,10 @@ def test_reward_shrinks_while_the_mean_return_is_below_its_best() -> None:
     assert factor(*[1.0] * 50) == 0.0  # with 50 that had -9
     assert factor(*[1.0] * 50) == pytest.approx(at_first, rel=0.1)
     assert factor(*[2.0] * 100) > 0.0  # a new best
+    for name, values in resumed.statistics.items():
+        values.copy_(curious.statistics[name])
+    assert factor(*[2.0] * 100, of=resumed) > 0.0
+    assert factor(*[1.0] * 100, of=resumed) == 0.0
 
 
 def test_curiosity_refuses_gradients_of_actors() -> None:
