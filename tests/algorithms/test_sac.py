@@ -314,6 +314,19 @@ def test_convolutions_are_those_of_the_critics(action: ActionSpace) -> None:
     sac.after_update(1, computer.forward)
     assert same()
 
+    def seeded() -> dict[str, Tensor]:
+        torch.manual_seed(7)
+        return sac.gradients(batch)[0]
+
+    before = seeded()
+    parts = sac.statistics["target_critics"].split([each.numel() for each in critics.parameters()])
+    for (name, _), part in zip(critics.named_parameters(), parts, strict=True):
+        if "convolutions" in name:
+            part.add_(0.1)
+    after = seeded()
+    assert torch.equal(before["policy"], after["policy"])
+    assert not torch.equal(before["critics"], after["critics"]), "the target critics have convolutions of their own"
+
 
 def test_images_are_shifted_with_their_borders_repeated() -> None:
     encoder = ImageEncoder(
