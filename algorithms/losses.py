@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss, mse_loss
 
 from daedalus.algorithms.returns import Targets
-from daedalus.protocol.spec import LossSpec
+from daedalus.protocol.spec import LossSpec, Surrogate
 
 _ROUNDING = 1e-4  # a deviation below this share of the mean may be only the rounding of float32
 _NEGLIGIBLE = 1e-6  # a variance of the targets below this share of their mean square: they are equal
@@ -28,18 +28,17 @@ def mean(values: Tensor, shares: Tensor) -> Tensor:
     return values.flatten().dot(shares.flatten())
 
 
-def normalized(advantages: Tensor, valid: Tensor, least: float = 0.0) -> Tensor:
+def normalized(advantages: Tensor, valid: Tensor) -> Tensor:
     """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows.
 
-    The deviation is less than 1 where the advantages are equal except for rounding, or theirs is less than `least`.
-    `valid` [T, B] is 1 or 0.
+    The deviation is less than 1 where the advantages are equal except for rounding. `valid` [T, B] is 1 or 0.
     """
     # Not by shares, whose rounding would make equal advantages differ from 0.
     number = valid.sum().clamp(min=1.0)
     average = (advantages * valid).sum() / number
     centred = advantages - average
     deviation = ((centred.square() * valid).sum() / number).sqrt()
-    return centred / (deviation.maximum(_ROUNDING * average.abs()).clamp(min=least) + 1e-8)
+    return centred / (deviation.maximum(_ROUNDING * average.abs()) + 1e-8)
 
 
 def policy_factors(spec: LossSpec, targets: Targets, valid: Tensor) -> Tensor:
@@ -49,7 +48,7 @@ def policy_factors(spec: LossSpec, targets: Targets, valid: Tensor) -> Tensor:
     """
     if not spec.normalize_advantages:
         return targets.weights * targets.advantages
-    return targets.weights * normalized(targets.advantages, valid, spec.min_advantage_deviation)
+    return targets.weights * normalized(targets.advantages, valid)
 
 
 def policy_gradient_loss(log_probs: Tensor, factors: Tensor, shares: Tensor) -> Tensor:
@@ -60,48 +59,57 @@ def policy_gradient_loss(log_probs: Tensor, factors: Tensor, shares: Tensor) -> 
     return -mean(log_probs * factors.detach(), shares)
 
 
-def clipped_policy_loss(
-    log_ratios: Tensor, factors: Tensor, shares: Tensor, clip_range: float
+def surrogate_policy_loss(
+    log_ratios: Tensor, factors: Tensor, shares: Tensor, clip_range: float, surrogate: Surrogate
 ) -> tuple[Tensor, Tensor]:
-    """Return - mean min(r_t A_t, clip(r_t, 1 - c, 1 + c) A_t), and the share of rows whose ratio is out of the range.
+    """Return the policy loss of a pass over a batch, and the share of rows whose ratio r_t is not in 1 +- c.
 
-    A_t is a constant, and c the clip range. The minimum removes the gain from moving r_t out of the range: such rows
-    have no gradient. Where the share is near 0 the passes change the policy little, where it is near 1 too much.
+    With `clip`, PPO's: - mean min(r_t A_t, clip(r_t, 1 - c, 1 + c) A_t). The minimum removes the gain from moving r_t
+    out of the range: such rows have no gradient, and nothing brings back those that others moved out. Where the share
+    is near 0 the passes change the policy little, where it is near 1 too much. Schulman et al. (2017), equation 7.
 
-    Schulman et al. (2017), equation 7.
+    With `spo`, - mean (r_t A_t - |A_t| (r_t - 1)^2 / (2 c)): its best r_t is 1 + c sign(A_t), and what is beyond comes
+    back. Xie et al. (2025), "Simple Policy Optimization".
 
     Args:
       log_ratios: [T, B], log r_t: log pi(a_t|s_t) minus that of the proximal policy.
-      factors: [T, B], A_t.
+      factors: [T, B], A_t, constants.
       shares: [T, B].
       clip_range: c.
+      surrogate: see above.
     """
-    loss, clipped_share = _ClippedLoss.apply(log_ratios, factors, shares, clip_range)  # pyright: ignore
-    return loss, clipped_share
+    loss, outside = _SurrogateLoss.apply(log_ratios, factors, shares, clip_range, surrogate == "spo")  # pyright: ignore
+    return loss, outside
 
 
-class _ClippedLoss(torch.autograd.Function):
-    """Forward and backward pass of `clipped_policy_loss`; those that autograd derives take twice as many operations."""
+class _SurrogateLoss(torch.autograd.Function):
+    """Both passes of `surrogate_policy_loss`; those that autograd derives take twice as many operations."""
 
     @staticmethod
     def forward(
-        ctx: Any, log_ratios: Tensor, factors: Tensor, shares: Tensor, clip_range: float
+        ctx: Any, log_ratios: Tensor, factors: Tensor, shares: Tensor, clip_range: float, is_spo: bool
     ) -> tuple[Tensor, Tensor]:
         ratios = log_ratios.clamp(max=_MAX_LOG_RATIO).exp()
         clipped = ratios.clamp(1.0 - clip_range, 1.0 + clip_range)
-        gains = ratios * factors
-        lower = gains.minimum(clipped * factors)
-        # The rows that have a gradient: those whose ratio is not clipped, for which it is also that of the logarithm.
-        without = (gains > lower) | (log_ratios > _MAX_LOG_RATIO)
-        ctx.save_for_backward((gains * shares).masked_fill_(without, 0.0))
-        clipped_share = mean((ratios != clipped).to(shares.dtype), shares)
-        ctx.mark_non_differentiable(clipped_share)
-        return -mean(lower, shares), clipped_share
+        gains, too_large = ratios * factors, log_ratios > _MAX_LOG_RATIO
+        if is_spo:
+            changes = (ratios - 1.0) / clip_range
+            objective = gains.addcmul(factors.abs() * changes, ratios - 1.0, value=-0.5)
+            slopes = ratios * (factors - factors.abs() * changes)  # by the logarithm
+        else:
+            objective, slopes = gains.minimum(clipped * factors), gains
+            # The rows that have a gradient: those whose ratio is not clipped, for which it is also that of the
+            # logarithm.
+            too_large = too_large | (gains > objective)
+        ctx.save_for_backward((slopes * shares).masked_fill_(too_large, 0.0))
+        outside = mean((ratios != clipped).to(shares.dtype), shares)
+        ctx.mark_non_differentiable(outside)
+        return -mean(objective, shares), outside
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (rows,) = ctx.saved_tensors
-        return -gradients[0] * rows, None, None, None
+        return -gradients[0] * rows, None, None, None, None
 
 
 def value_loss(values: Tensor, targets: Tensor, shares: Tensor, kind: Literal["mse", "huber"]) -> Tensor:

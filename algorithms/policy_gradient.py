@@ -9,7 +9,7 @@ from torch import Tensor
 from daedalus.algorithms.algorithm import Algorithm, Forward, Losses, MinibatchLosses
 from daedalus.algorithms.batch import Batch, Pass
 from daedalus.algorithms.diagnostics import FirstPass
-from daedalus.algorithms.losses import clipped_policy_loss, policy_factors, policy_gradient_loss, shares_of
+from daedalus.algorithms.losses import policy_factors, policy_gradient_loss, shares_of, surrogate_policy_loss
 from daedalus.algorithms.minibatches import Minibatch, draw_pass, minibatches
 from daedalus.algorithms.returns import Targets, lambda_targets, vtrace_corrected_targets
 from daedalus.protocol.algorithms import ALGORITHMS
@@ -118,14 +118,16 @@ class Appo(Algorithm):
         log_probs, entropies = self.distribution.log_prob_and_entropy(parameters, minibatch.actions, minibatch.masks)
         log_ratios = log_probs - minibatch.log_probs
         shares = minibatch.shares
-        policy_loss, clipped = clipped_policy_loss(log_ratios, minibatch.factors, shares, self.spec.clip_range)
+        policy_loss, outside = surrogate_policy_loss(
+            log_ratios, minibatch.factors, shares, self.spec.clip_range, self.spec.surrogate
+        )
         return Losses(
             policy_loss=policy_loss,
             entropies=entropies,
             values=values,
             targets=minibatch.targets,
             shares=shares,
-            clipped_fraction=clipped,
+            clipped_fraction=outside,
             value_loss=self.value_loss(minibatch, values),
         )
 

@@ -32,6 +32,7 @@ from daedalus.protocol.texts import bounded_text, exact_number
 Backend = Literal["gymnasium", "envpool", "ale", "fast", "pettingzoo"]
 GAME_PACKAGES = ("pettingzoo", "mpe2")  # whose modules are games with several agents
 FrameStackSize = Annotated[int, Field(ge=1, le=16)]
+Surrogate = Literal["clip", "spo"]
 Codes = Annotated[tuple[Annotated[int, Field(ge=1, le=256)], ...], Field(min_length=1, max_length=256)]
 _OBJECT = r"\w+(\.\w+)*:\w+"  # module:name
 _Part = TypeVar("_Part", bound=Specification)
@@ -278,6 +279,9 @@ class LossSpec(Specification):
     (environments with memory, else valid rows) makes as many minibatches as it has parts."""
     clip_range: Annotated[float, Field(gt=0.0)] = 0.2
     """Clip range of the ratio between the probabilities of the new and the proximal policy; `appo` only."""
+    surrogate: Surrogate = "clip"
+    """What keeps the ratio in the clip range. `clip`: PPO's, no gradient beyond it; `spo`: a quadratic penalty, which
+    brings back what is beyond it, learns more slowly at the same range, and keeps what is learned. `appo` only."""
     proximal_policy: Literal["newest", "behaviour"] = "newest"
     """Policy that the clip keeps the new one near: the `newest` before the batch, or the `behaviour` policy, which
     played the row. With `behaviour` the clip bounds the change over the policy lag too. Where actors explore it is
@@ -302,9 +306,6 @@ class LossSpec(Specification):
     normalize_advantages: bool = False
     """Scale the advantages of each batch to mean 0 and standard deviation 1. With `collection.upload=gradients`, each
     actor scales those of each rollout."""
-    min_advantage_deviation: Annotated[float, Field(ge=0.0)] = 0.0
-    """With `normalize_advantages`: smallest standard deviation that advantages are divided by. With 1, and normalised
-    rewards, small ones are not scaled up, such as those of a task that is solved."""
 
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Precision of the forward passes. `auto`: bfloat16 for convolutions where the hardware multiplies it."""

@@ -63,10 +63,10 @@ def default_settings(
     if codes:
         settings["policy"]["codes"] = {name: list(numbers) for name, numbers in codes.items()}
         if kind == "vectors_discrete":
-            # What is left of the advantages when a grid is solved is noise: scaled up to the size of those that it was
-            # learned from, it spoils the policy within a batch (docs/results.md).
-            settings["training"]["min_advantage_deviation"] = 1.0
-            settings["with_memory"]["training"]["min_advantage_deviation"] = 0.0  # was not measured with one
+            # When a grid is solved, what is left of the advantages is noise, and the policy is nearly certain: with
+            # PPO's clipping it is lost within a batch (docs/results.md).
+            settings["training"]["surrogate"] = "spo"
+            settings["with_memory"]["training"]["surrogate"] = "clip"  # the other was not measured with one
     if leave_out:
         settings.setdefault("environment", {})["leave_out"] = list(leave_out)
     return settings

@@ -296,14 +296,14 @@ def unread_settings(spec: RunSpec) -> set[str]:
         return set()  # which may read any
     has_returns = record.heads == "policy_and_value"
     unread = {
-        "training.passes training.minibatches training.clip_range training.proximal_policy": record.passes_over_batch,
+        "training.passes training.minibatches training.clip_range training.surrogate "
+        "training.proximal_policy": record.passes_over_batch,
         "training.trace_lambda": not record.replay and not training.algorithm.startswith("one_step"),
         "training.rho_clip": record.corrected or (has_returns and training.explores),
         "training.trace_clip": record.corrected,
         "training.target_period": record.target_network,
         "training.value_loss training.value_coefficient": not record.replay,
         "training.entropy_bonus training.entropy_bonus_final training.normalize_advantages": has_returns,
-        "training.min_advantage_deviation": has_returns and training.normalize_advantages,
         "training.mean_first_value": has_returns and not spec.uploads_gradients,
         "training.replay_transitions training.replay_megabytes training.replay_saved training.replay_begin "
         "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate "

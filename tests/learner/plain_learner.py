@@ -72,7 +72,10 @@ class PlainLearner:
         goals = torch.tensor([targets[cell][0] for cell in cells])
         entropy = torch.stack([entropies[cell] for cell in cells]).mean()
         ratios = torch.stack([(log_probs[cell] - before[cell]).exp() for cell in cells])
-        if spec.algorithm == "appo":
+        if spec.algorithm == "appo" and spec.surrogate == "spo":
+            penalties = advantages.abs() * (ratios - 1.0) ** 2 / (2.0 * spec.clip_range)
+            policy_loss = (penalties - ratios * advantages).mean()
+        elif spec.algorithm == "appo":
             clipped = ratios.clip(1.0 - spec.clip_range, 1.0 + spec.clip_range)
             policy_loss = -torch.minimum(ratios * advantages, clipped * advantages).mean()
         else:

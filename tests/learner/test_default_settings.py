@@ -165,19 +165,19 @@ def test_components_to_leave_out_become_a_setting() -> None:
 
 
 @pytest.mark.parametrize(
-    ("observations", "codes", "kind", "least"),
+    ("observations", "codes", "kind", "surrogate"),
     [
-        ((CHOICES, image(7, 7, 3)), {"1": (11, 6, 4)}, "vectors_discrete", 1.0),
-        ((image(19, 19, 3),), {"0": (11, 6, 4)}, "vectors_discrete", 1.0),
+        ((CHOICES, image(7, 7, 3)), {"1": (11, 6, 4)}, "vectors_discrete", "spo"),
+        ((image(19, 19, 3),), {"0": (11, 6, 4)}, "vectors_discrete", "spo"),
         ((image(7, 7, 3), image(96, 96, 3)), {"0": (11, 6, 4)}, "images", None),
         ((image(7, 7, 3),), {}, "vectors_discrete", None),
     ],
 )
-def test_codes_are_no_images_and_are_set_and_their_small_advantages_stay_small(
-    observations: tuple[Any, ...], codes: dict[str, tuple[int, ...]], kind: str, least: float | None
+def test_codes_are_no_images_and_are_set_and_learned_with_spo(
+    observations: tuple[Any, ...], codes: dict[str, tuple[int, ...]], kind: str, surrogate: str | None
 ) -> None:
     where = spaces(CHOICES, *observations)
     settings = default_settings(where, codes=codes)
     assert PolicySpec.model_validate(settings["policy"]).codes == codes
-    assert settings["training"].get("min_advantage_deviation") == least
+    assert settings["training"].get("surrogate") == surrogate
     assert kind_of(where, codes) == kind

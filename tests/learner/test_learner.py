@@ -69,6 +69,7 @@ KINDS = {
         "rho_clip": 1.5,
         "exploration": (0.1,),
     },
+    "appo, spo": {"algorithm": "appo", "surrogate": "spo", "trace_lambda": 0.95, "clip_range": 0.05},
     "appo, one update": {"algorithm": "appo", "passes": 1, "minibatches": 1},
     "appo, all": {
         "algorithm": "appo",

@@ -147,7 +147,7 @@ OUT_OF_RANGE: dict[type[Specification], dict[str, list[Any]]] = {
         "precision": ["float16"],
         "value_loss": ["mae"],
         "value_coefficient": [-0.1],
-        "min_advantage_deviation": [-0.1],
+        "surrogate": ["ppo"],
         "entropy_bonus": [-0.1],
         "entropy_bonus_final": [-0.1],
         "curiosity": [-0.1, 101.0],
