@@ -286,6 +286,7 @@ class RolloutWriter:
         if not self._row or not self._valid[self._row - 1].all():
             return False
         self._truncated[self._row - 1] = True
+        self._overridden[self._row] = self._taught[self._row] = False
         self._episodes.cut()
         return True
 

@@ -51,9 +51,9 @@ class Loop:
     def observe(self) -> None:
         self.rows.observe(np.array([self.episode, self.step], np.float32))
 
-    def act(self) -> None:
+    def act(self, override: int | None = None) -> None:
         self.observe()
-        while self.rows.choose() is None:
+        while self.rows.choose(override=override) is None:
             pass
         self.rows.reward(self.episode + self.step / 100)
         self.step += 1
@@ -105,6 +105,18 @@ def test_episode_of_an_interrupted_loop_is_truncated_at_its_newest_observation()
     assert rollout.frames["observation"][1:, 0].tolist() == [[1, 0], [1, 1], [1, 2], [2, 0], [2, 1], [2, 2]]
     assert rollout.episode_lengths.tolist() == [2]
     np.testing.assert_allclose(rollout.episode_returns, [1.0 + 1.01])
+    check(rollout)
+
+
+def test_override_of_an_interrupted_loop_is_in_no_row() -> None:
+    loop = Loop()
+    for override in (None, None, 1):
+        loop.act(override)
+    loop.cut(while_it_waits=False)
+    for _ in range(3):
+        loop.act()
+    (rollout,) = loop.rollouts
+    assert rollout.overridden is None
     check(rollout)
 
 
