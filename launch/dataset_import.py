@@ -15,6 +15,7 @@ from daedalus.learner.run.demonstration_files import (
     PART_BYTES,
     DemonstrationsWriter,
     check_memory,
+    check_spaces,
     rows_of_rollout,
 )
 from daedalus.learner.run.settings import SettingsError
@@ -46,16 +47,13 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
     try:
         with MinariReader(name, spec.environment.leave_out) as dataset:
             transforms = Transforms(spec.environment, dataset.observation_space, dataset.action_space)
-            if spaces is not None and transforms.spaces.without_masks() != spaces.without_masks():
-                raise SettingsError(
-                    f"dataset {name} has other spaces than the run: {transforms.spaces} in the dataset, and "
-                    f"{spaces} in the run"
-                )
+            if spaces is not None:
+                check_spaces(name, transforms.spaces, spaces)
             _warn(dataset, spec.environment)
             rows = rows_of_rollout(transforms.spaces)
             columns = -(-(dataset.steps + dataset.episodes) // rows)
             check_memory(dataset.steps, columns * transforms.spaces.replay_bytes(rows))
-            writer = DemonstrationsWriter(directory, name)
+            writer = DemonstrationsWriter(directory, name, transforms.spaces)
             try:
                 rollouts = demonstration_rollouts(dataset, transforms, spec.environment)
                 newest = next(rollouts)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, Field, ValidationError
 
+from daedalus.learner.run.resuming import differing_spaces
 from daedalus.learner.run.run_directory import DEMONSTRATIONS
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.upload_checks import first_component_violation, number_violation
@@ -36,6 +37,7 @@ class PartContent(BaseModel):
     rows: int = Field(ge=1, le=MOST_ROWS)  # T, the same in all parts
     columns: int = Field(ge=1, le=1 << 31)  # E
     steps: int = Field(ge=0, le=1 << 62)  # that can be learned from
+    spaces: Spaces | None = None  # of the dataset, after the transforms of the run; absent in those of earlier versions
     last: bool = False
 
 
@@ -67,12 +69,20 @@ def check_memory(steps: int, size: int, taken: int = 0) -> None:
         )
 
 
+def check_spaces(dataset: str, spaces: Spaces, of_run: Spaces) -> None:
+    """Raise SettingsError unless the spaces of a dataset are those of the run, apart from masks."""
+    there, here = spaces.without_masks(), of_run.without_masks()
+    if there != here:
+        differing = "; ".join(differing_spaces(there, here))
+        raise SettingsError(f"dataset {dataset} (there) has other spaces than the run (here): {differing}")
+
+
 class DemonstrationsWriter:
     """Writes the demonstrations of a run: all of them, or none."""
 
-    def __init__(self, directory: Path, dataset: str) -> None:
-        """`directory` is that of the run, and `dataset` the name of what they come from."""
-        self._folder, self._dataset = directory / DEMONSTRATIONS, dataset
+    def __init__(self, directory: Path, dataset: str, spaces: Spaces) -> None:
+        """`directory` is that of the run; `dataset` is the name of what they come from, and `spaces` its spaces."""
+        self._folder, self._dataset, self._spaces = directory / DEMONSTRATIONS, dataset, spaces
         self._partial = directory / f".{DEMONSTRATIONS}.partial"
         shutil.rmtree(self._partial, ignore_errors=True)
         self._parts = 0
@@ -84,6 +94,7 @@ class DemonstrationsWriter:
             rows=rollout.rows,
             columns=rollout.environments,
             steps=rollout.agent_steps,
+            spaces=self._spaces,
             last=last,
         )
         write_sealed(self._partial / f"{self._parts:08d}", {_FILE: encode(rollout)}, content.model_dump())
@@ -138,6 +149,8 @@ class DemonstrationFiles:
         """Yield all rollouts, each checked. Raises DamagedError, or SettingsError if they do not fit the run."""
         size = max(2 * PART_BYTES, spaces.replay_bytes(self.rows) if self._contents else 0) + _SLACK_BYTES
         for (path, part), content in zip(self._parts, self._contents, strict=True):
+            if content.spaces is not None:
+                check_spaces(content.dataset, content.spaces, spaces)
             try:
                 rollout = decode(part.read(_FILE, size), Limits(max_bytes=size))
             except ProtocolError as error:

@@ -140,20 +140,25 @@ def other_spaces(policy: SavedPolicy, environment: EnvironmentSpec, spaces: Spac
 
     Weights fit wherever the shapes do, but a policy means nothing by numbers of another name, order or scale.
     """
-    found = [
-        *_components("observation", policy.spaces.observations, spaces.observations),
-        *_components("action", policy.spaces.actions, spaces.actions),
-    ]
+    found = differing_spaces(policy.spaces, spaces)
     for name in ("action_table", "action_table_columns"):  # what the choices mean
         if getattr(policy.spec.environment, name) != getattr(environment, name):
             found.append(f"environment.{name} is another")
     return "; ".join(found)
 
 
+def differing_spaces(before: Spaces, now: Spaces) -> list[str]:
+    """Return in what the spaces of another run or of a dataset, "there", differ from those of a run, "here"."""
+    return [
+        *_components("observation", before.observations, now.observations),
+        *_components("action", before.actions, now.actions),
+    ]
+
+
 def _components(kind: str, before: dict[str, Any], now: dict[str, Any]) -> list[str]:
     missing, new = (", ".join(sorted(one.keys() - other.keys())) for one, other in ((before, now), (now, before)))
-    found = [f"{kind} {missing} is not in this run"] if missing else []
-    found += [f"{kind} {new} is not in that run"] if new else []
+    found = [f"{kind} {missing} is not here"] if missing else []
+    found += [f"{kind} {new} is not there"] if new else []
     for name in before.keys() & now.keys():
         if before[name] != now[name]:
             found.append(f"{kind} {name} is {_in_detail(before[name])} there, and {_in_detail(now[name])} here")

@@ -209,7 +209,7 @@ def array(**changes: Any) -> dict[str, Any]:
         (
             saved(),
             saved({"lidar": PAIR["angle"], "pose": PAIR["angle"]}),
-            "observation angle, speed is not in this run; observation lidar, pose is not in that run",
+            "observation angle, speed is not here; observation lidar, pose is not there",
         ),
         (
             saved(),

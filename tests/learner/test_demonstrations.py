@@ -262,7 +262,7 @@ def test_a_hostile_dataset_is_refused_in_one_line_and_nothing_is_left(
 def test_a_dataset_that_does_not_fit_the_run_or_the_memory_is_refused(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with pytest.raises(SettingsError, match=r"float32 array of shape \(2,\);.*in the dataset, and .*3 stacked.*run"):
+    with pytest.raises(SettingsError, match=r"float32 array of shape \(2,\) there, and .*3 stacked here"):
         write_demonstrations("arm/shown-v0", spec_of(), spaces_of(3), tmp_path)
     with pytest.raises(SettingsError, match="impala does not learn from demonstrations"):
         write_demonstrations("arm/shown-v0", RunSpec.model_validate({"environment": {"id": "A-v0"}}), None, tmp_path)
@@ -270,6 +270,9 @@ def test_a_dataset_that_does_not_fit_the_run_or_the_memory_is_refused(
         write_demonstrations("nowhere", spec_of(), None, tmp_path)
     with caplog.at_level(logging.WARNING):
         write_demonstrations("arm/shown-v0", spec_of(), None, tmp_path)
+    others = spaces_of().model_copy(update={"actions": {"action": ContinuousSpace(low=(-1.0, 0.0), high=(1.0, 1.0))}})
+    with pytest.raises(SettingsError, match=r"\(low -2 0, .*\) there, and .*\(low -1 0, .*\) here"):
+        read_demonstrations(tmp_path, spec_of(), others, 0)
     monkeypatch.setattr(demonstration_files, "available_memory", lambda: 3200)
     with pytest.raises(SettingsError, match=r"19 steps take .* MiB .*: \d+ steps fit"):
         read_demonstrations(tmp_path, spec_of(), spaces_of(), 0)
