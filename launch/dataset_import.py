@@ -122,8 +122,8 @@ def _learnable(episode: Episode, transforms: Transforms, environment: Environmen
         frames[name] = values.astype(transforms.spaces.observations[name].dtype, copy=False)
     actions = transforms.policy_actions(episode.actions)
     ends = np.zeros((2, steps + 1), np.bool_)
-    # A recording that breaks off is cut: the episode would have gone on.
-    ends[:, steps - 1] = episode.terminated, episode.truncated or not episode.terminated
+    # A recording that breaks off is cut: the episode would have gone on. A termination at a limit is a termination.
+    ends[:, steps - 1] = episode.terminated, not episode.terminated
     rewards = np.append(episode.rewards, 0.0)
     if np.abs(rewards).max() > LARGEST_REWARD:
         raise ValueError(f"a reward is beyond +-{LARGEST_REWARD:g}")

@@ -109,6 +109,15 @@ def expected(frames: int) -> list[tuple[list[float], list[float], list[float], f
     return sorted(found)
 
 
+def test_terminations_at_a_time_limit_are_bootstrapped_as_those_of_actors(dataset: Path, tmp_path: Path) -> None:
+    spec, changes = spec_of(), {"bootstrap_terminations": True, "no_reward_limit": 5}
+    spec = spec.model_copy(update={"environment": spec.environment.model_copy(update=changes)})
+    write_demonstrations(str(dataset), spec, spaces_of(), tmp_path)
+    buffer = read_demonstrations(tmp_path, spec, spaces_of(), 0)
+    assert buffer is not None
+    assert buffer.transitions(buffer.learned_rows, 1, 0.9).discounts.tolist() == pytest.approx([0.9] * 19)
+
+
 @pytest.mark.parametrize("part_bytes", [1, 300, 16 << 20])
 @pytest.mark.parametrize("frames", [1, 3])
 def test_transitions_are_those_of_the_recorded_episodes(
