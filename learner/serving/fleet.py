@@ -399,7 +399,7 @@ class Fleet:
             epsilon = self.epsilon_for(join.actor)
             self.actors[join.actor] = Actor(join.actor, forgotten_before=self.forgotten, epsilon=epsilon)
             self._of_owner[keys.owner(join.actor)] += 1
-        self.spaces = join.spaces
+        self.spaces = self.spaces or join.spaces  # equal ones may have their components in another order
         self.refused_joins.joined(join.actor)
         actor = self.actors[join.actor]
         actor.last_seen = now

@@ -7,7 +7,7 @@ from daedalus.learner.serving import fleet as fleet_module
 from daedalus.learner.serving import query_responses
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import PAGE_ACTORS, Join, Refusal
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces
 
 WINDOW = 1024
 MINUTE = 60.0
@@ -39,6 +39,21 @@ def test_first_join_with_spaces_sets_the_spaces_of_the_run() -> None:
     fleet = Fleet(1, None)
     assert fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=2), 0.0) is None
     assert fleet.spaces == SPACES
+
+
+def test_components_of_the_run_stay_in_their_order() -> None:
+    """The weights of a checkpoint depend on it."""
+    both: ObservationSpaces = {
+        "a": ArraySpace(shape=(2,), dtype="float32"),
+        "b": ArraySpace(shape=(2,), dtype="float32"),
+    }
+    spaces, reversed_ones = (
+        Spaces(observations=each, actions=SPACES.actions) for each in (both, dict([*both.items()][::-1]))
+    )
+    fleet = Fleet(1, spaces)
+    assert fleet.join(Join(actor="a", incarnation=1, spaces=reversed_ones, environments=1), 0.0) is None
+    assert fleet.spaces is not None
+    assert [*fleet.spaces.observations] == ["a", "b"]
 
 
 def test_join_with_other_spaces_is_refused_with_both_spaces_named() -> None:
