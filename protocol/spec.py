@@ -370,8 +370,8 @@ class TrainingSpec(LossSpec):
     """Env_steps of all actors together in which epsilon falls linearly from 1 to the number that the actor drew; 0: it
     has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
     replay_transitions: PositiveInt = 1_000_000
-    """Newest transitions that the replay buffer keeps, at most as many as `env_steps`; `sac` only, as are the next
-    eight settings."""
+    """Newest transitions that the replay buffer keeps, at most twice as many as `env_steps`: reset rows and those that
+    people play take room, too. `sac` only, as are the next eight settings."""
     replay_megabytes: Annotated[float, Field(gt=0.0)] | None = None
     """MiB of memory that the replay buffer may need: one that needs more is refused. Unset: three quarters of the
     memory that is available when the learner starts."""
@@ -379,7 +379,7 @@ class TrainingSpec(LossSpec):
     """Save the replay buffer in the run directory, with each checkpoint. A resumed run otherwise begins with an empty
     one."""
     replay_begin: NaturalInt = 1000
-    """Transitions in the replay buffer before updates begin; at most half of its capacity."""
+    """Transitions in the replay buffer before updates begin; at most half of its capacity, and of `env_steps`."""
     updates_per_env_step: Annotated[float, Field(gt=0.0, le=64.0)] = 1.0
     """Updates for each env_step that is received. Actors wait for a learner that falls behind."""
     minibatch_rows: Annotated[int, Field(ge=1, le=65_536)] = 256

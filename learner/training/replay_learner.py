@@ -53,7 +53,7 @@ class ReplayLearner(Learner):
             **{name: build_optimizer(spec, values) for name, values in algorithm.learned.items()},
         }
         self.demonstrations: ReplayBuffer | None = None
-        self._begin = max(min(spec.replay_begin, self.replay.capacity // 2), 1)
+        self._begin = max(min(spec.replay_begin, self.replay.capacity // 2, spec.env_steps // 2), 1)
         self._owed = torch.zeros((), dtype=torch.float64)  # updates that rows have earned, and that are not made yet
         # Of the run: its buffer on the disk has the same.
         self._identity = torch.tensor(secrets.randbits(62))
@@ -177,7 +177,8 @@ class ReplayLearner(Learner):
 
 def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int) -> ReplayBuffer:
     """Return an empty buffer. Raises SettingsError, with how many transitions would fit, if it is too large."""
-    capacity = min(spec.replay_transitions, spec.env_steps)
+    # An env_step is followed by a reset row at most; or a person helps in as many.
+    capacity = min(spec.replay_transitions, 2 * spec.env_steps)
     column = spaces.replay_bytes(rollout_length)
     columns = -(-capacity // rollout_length)
     if spec.replay_megabytes is not None:

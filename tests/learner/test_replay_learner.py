@@ -85,6 +85,17 @@ def test_each_row_earns_its_updates_after_the_beginning() -> None:
     assert planned == np.diff([0, *versions]).tolist()
 
 
+def test_buffer_has_room_for_all_env_steps_of_a_run_beside_its_reset_rows_or_as_many_of_people() -> None:
+    learners = [ReplayLearner(spec_of(env_steps=32, replay_begin=32), SPACES) for _ in range(2)]
+    for seed in range(8):
+        ends = np.tile([[True], [False]] * (ROWS // 2), ENVIRONMENTS)  # episodes of one step
+        learners[0].replay.add(replace(rollout(seed), terminated=ends, valid=ends))
+        by_people = rollout(seed).valid if seed < 4 else None
+        learners[1].replay.add(replace(rollout(seed), overridden=by_people, taught=by_people))
+    assert [(len(each.replay), each.replay.taught) for each in learners] == [(32, 0), (32, 32)]
+    assert [each.updates_of([rollout(9)]) for each in learners] == [8, 8]  # half of the budget is enough to begin
+
+
 def test_updates_change_policy_critics_and_temperature() -> None:
     learner = trained(ReplayLearner(spec_of(), SPACES), 0)
     before = {name: values.copy() for name, values in learner.weights().items()}
