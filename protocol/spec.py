@@ -381,7 +381,8 @@ class TrainingSpec(LossSpec):
     replay_begin: NaturalInt = 1000
     """Transitions in the replay buffer before updates begin; at most half of its capacity, and of `env_steps`."""
     updates_per_env_step: Annotated[float, Field(gt=0.0, le=64.0)] = 1.0
-    """Updates for each env_step that is received. Actors wait for a learner that falls behind."""
+    """Updates for each env_step that is received; in a game, for each step of an agent. Actors wait for a learner that
+    falls behind."""
     minibatch_rows: Annotated[int, Field(ge=1, le=65_536)] = 256
     """Transitions that each update learns from, drawn uniformly from the replay buffer."""
     n_step: Annotated[int, Field(ge=1, le=64)] = 1
