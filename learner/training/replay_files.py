@@ -91,8 +91,9 @@ class ReplayFiles:
             )
         shapes = self._shapes()
         if content.columns != shapes:
+            rows = ", ".join(map(str, content.columns.get("rewards", ("", []))[1]))
             raise CheckpointMismatchError(
-                f"{path} has columns of other shapes than this run's: restore collection.rollout_length of the run, or "
+                f"{path} has columns of other shapes than this run's: restore collection.rollout_length={rows}, or "
                 f"remove the folder {self._folder} to begin with an empty buffer"
             )
         one = sum(np.dtype(dtype).itemsize * int(np.prod(shape, dtype=np.int64)) for dtype, shape in shapes.values())

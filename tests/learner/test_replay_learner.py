@@ -318,7 +318,7 @@ def test_the_buffer_of_another_run_or_of_other_rollouts_is_refused(tmp_path: Pat
     shutil.rmtree(tmp_path / FOLDER)
     saved(learner, tmp_path)
     longer = spec_of({"collection": {"rollout_length": 8}})
-    with pytest.raises(CheckpointMismatchError, match=r"restore collection\.rollout_length"):
+    with pytest.raises(CheckpointMismatchError, match=r"restore collection\.rollout_length=4,"):
         resumed(learner, tmp_path, longer)
 
 
