@@ -123,7 +123,9 @@ class TrainingLoop:
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
         # A copy of the run directory must have a newer epoch than a learner that has resumed here: save its count soon.
         soon_after = self._learner.policy_version if self._context.starts > 1 else math.inf
-        while not self._context.stop.is_set() and self._counters.env_steps < training.env_steps:
+        while not self._context.stop.is_set() and (
+            self._counters.env_steps < training.env_steps or self._learner.updates_due
+        ):
             self._beat()
             reporter.look(self._update())
             self._evaluators.serve(self._learner, self._checkpointer)

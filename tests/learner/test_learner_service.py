@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -21,6 +22,7 @@ from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.actor_service import ActorService
+from daedalus.algorithms.sac import Sac
 from daedalus.analysis.recorded_run import read_metrics
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics_rows import Details
@@ -31,6 +33,7 @@ from daedalus.learner.run.run_directory import read_json, write_json
 from daedalus.learner.service import LearnerService, Outputs
 from daedalus.learner.serving.events import read_events
 from daedalus.learner.serving.run_context import RunContext
+from daedalus.learner.training import replay_learner
 from daedalus.learner.training.checkpoint import Checkpoint, load_newest
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.replay_learner import ReplayLearner
@@ -259,6 +262,22 @@ def test_a_replay_buffer_has_all_rollouts_that_were_accepted_before_a_stop(
         goes_on.set()
         training_run.end()
     assert len(kept) == read_json(training_run.directory / "summary.json")["rollouts_accepted"] >= 5
+
+
+def test_a_run_ends_when_all_updates_of_its_budget_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gradients = Sac.gradients
+    monkeypatch.setattr(Sac, "gradients", lambda *given: time.sleep(0.01) or gradients(*given))
+    monkeypatch.setattr(replay_learner, "_SLICE_SECONDS", 0.005)  # one update
+    training_run = TrainingRun(
+        tmp_path,
+        environment={"id": "Pendulum-v1"},
+        policy={"hidden": [8], "distribution": "squashed_gaussian", "state_dependent_std": True},
+        collection={"actors": 1, "envs_per_actor": 1, "rollout_length": 4},
+        training={"algorithm": "sac", "minibatch_rows": 8, "env_steps": 12, "updates_per_env_step": 2.0},
+    )
+    training_run.finish()
+    summary, (newest, *_) = read_json(training_run.directory / "summary.json"), checkpoints(training_run.directory)
+    assert read_policy(newest).policy_version == summary["updates"] > 0
 
 
 def test_what_is_known_of_a_batch_late_is_in_the_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
