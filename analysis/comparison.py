@@ -221,6 +221,8 @@ def notes(comparison: Comparison) -> list[str]:
         )
     if comparison.incomparable:
         lines.append(comparison.incomparable)
+    elif any(math.isnan(result.final_return.value) for result in comparison.results):
+        lines.append("final return -: in a run of the group no episode has ended")
     if comparison.other_task and comparison.threshold is not None:
         lines.append(
             "reached, env_steps and minutes: by evaluations during training (evaluation.seconds; -: there were none), "

@@ -31,13 +31,14 @@ def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
     Less sensitive to single runs than the mean, and less wasteful than the median. Agarwal et al. (2021), section 4.3.
 
     Args:
-      scores: any shape.
+      scores: any shape; the mean with one that is unknown (NaN) is unknown.
       axis: axis of the runs.
     """
     runs = scores.shape[axis]
     cut = runs // 4
     middle = np.sort(scores, axis).take(np.arange(cut, runs - cut), axis)
-    return middle.mean(axis)
+    # The highest is NaN if one is: it would be cut off as the best run.
+    return middle.mean(axis) + np.where(np.isnan(scores).any(axis), np.nan, 0.0)
 
 
 def stratified_bootstrap(
@@ -132,4 +133,4 @@ def _improvements(samples: Strata) -> np.ndarray:
 
 
 def _better(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return (x > y) + 0.5 * (x == y)
+    return np.where(np.isnan(x) | np.isnan(y), np.nan, (x > y) + 0.5 * (x == y))

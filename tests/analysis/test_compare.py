@@ -98,12 +98,26 @@ def test_returns_of_different_tasks_are_not_compared(folder: Path, capsys: pytes
     record(folder / "plain", evaluation=None)
     assert compare(["shaped", "plain"]) == 0
     output = capsys.readouterr().out
-    assert [line.split()[1:5] for line in output.splitlines()[2:4]] == [["1", "-", "-", "-"]] * 2
+    assert [line.split()[1:] for line in output.splitlines()[2:4]] == [["1", "-", "-", "-", "-"], ["1", *"-----"]]
     assert "final returns cannot be compared: training plays different tasks" in output
     assert "such as with: daedalus evaluate " in output
     record(folder / "same", settings=["environment.no_reward_limit=9"], seed=2, evaluation=None)
     assert compare(["shaped", "same"]) == 0
     assert "cannot be compared" not in capsys.readouterr().out
+
+
+def test_a_run_in_which_no_episode_has_ended_is_not_taken_for_the_best(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in range(4):
+        record(folder / f"fast-{seed}", settings=FAST, seed=seed, evaluation=None)
+        returns = (None, None, None) if seed == 3 else (1.0, 2.0, 3.0)
+        record(folder / f"slow-{seed}", settings=SLOW, seed=seed, evaluation=None, returns=returns)
+    assert compare([str(path) for path in folder.iterdir()]) == 0
+    output = capsys.readouterr().out
+    fast, slow = (line.split() for line in output.splitlines()[2:4])
+    assert (fast[2], slow[2], slow[-1]) == ("480.0", "-", "-")
+    assert "no episode has ended" in output
 
 
 def test_one_seed_has_no_interval(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
