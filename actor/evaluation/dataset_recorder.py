@@ -15,7 +15,7 @@ from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.minari_files import Episode, MinariWriter
 from daedalus.actor.evaluation.gamepad import INSTALL_PYGAME, Gamepad
-from daedalus.actor.evaluation.loaded_policy import Policy
+from daedalus.actor.evaluation.loaded_policy import Policy, another_player
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -43,7 +43,7 @@ class PolicyPlayer:
 
     def __init__(self, policy: Policy, *, sampled: bool) -> None:
         """`sampled`: sample the actions, in place of the most probable ones."""
-        self._policy, self._sampled = policy, sampled
+        self._policy, self._sampled = another_player(policy, Policy), sampled
 
     def reset(self, seed: int) -> None:
         """See Player."""

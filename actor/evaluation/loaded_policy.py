@@ -242,8 +242,13 @@ def exported_bytes(policy: Policy, options: "ExportOptions") -> bytes:
 
 
 def another_player(policy: Policy, kind: type[_Kind]) -> _Kind:
-    """Return another player of the same policy, of a class that derives from Policy, at the start of an episode."""
-    return kind(policy._saved, policy.observation_space, policy.action_space, policy._modules)
+    """Return another player of the same policy, of a class that derives from Policy, at the start of an episode.
+
+    It is for the run's own environment, which takes the maximum of two frames itself where `act` would.
+    """
+    player = kind(policy._saved, policy.observation_space, policy.action_space, policy._modules)
+    player._pools_frames = False
+    return player
 
 
 def environments_of(policy: Policy) -> BackendEnvironments:

@@ -13,7 +13,13 @@ from daedalus.actor.environments.atari import PooledFrames, RandomStart
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.loaded_policy import load_policy
+from daedalus.actor.evaluation.dataset_recorder import PolicyPlayer, recorded_environment
+from daedalus.actor.evaluation.episodes import RunningEpisodes
+from daedalus.actor.evaluation.export_check import play_exported
+from daedalus.actor.evaluation.exported_policy import ExportOptions
+from daedalus.actor.evaluation.loaded_policy import exported_bytes, load_policy
+from daedalus.policy.acting.noise import neutral_noise
+from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spec import EnvironmentSpec
 
 pytest.importorskip("ale_py.vector_env")
@@ -127,6 +133,40 @@ def test_a_policy_in_a_loop_of_the_caller_sees_pooled_frames(tmp_path: Any, monk
     policy.reset()
     policy.act(frames[1])
     assert [int(each.max()) for each in seen] == [9, 5, 1]
+
+
+def test_recorded_and_exported_policies_see_what_evaluations_show(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = SPEC.model_copy(update={"resize": (20, 20)})
+    policy = load_policy(save(tmp_path / "run", small, 1, policy={"encoder": "mlp"}))
+    seen = list[np.ndarray]()
+    observe = RunningEpisodes.observe
+
+    def observe_noted(self: RunningEpisodes, observed: Any) -> None:
+        seen.append(observed.frames["observation"][0].copy())
+        observe(self, observed)
+
+    monkeypatch.setattr(RunningEpisodes, "observe", observe_noted)
+    steps, frames = 8, 8 * small.action_repeat
+    environments = make_environments(as_on_gymnasium(small), 1, one_episode=True)
+    episode = RunningEpisodes(environments.spaces, policy._runtime, 1)
+    observed = environments.reset(3)
+    for _ in range(steps):
+        episode.observe(observed)
+        observed = environments.step(episode.act(neutral_noise(policy._runtime.noise_size, 1)).actions)[0]
+    environments.close()
+    shown, seen[:] = list(seen), []
+    play_exported(policy, exported_bytes(policy, ExportOptions()), sampled=False, seed=3, steps=frames)
+    np.testing.assert_array_equal(seen, shown)
+    seen.clear()
+    player, environment = PolicyPlayer(policy, sampled=False), recorded_environment(small, NO_MODULES, for_person=False)
+    player.reset(3)
+    observation, _ = environment.reset(seed=3)
+    for _ in range(frames):
+        observation, *_ = environment.step(player.act(observation, None))
+    environment.close()
+    np.testing.assert_array_equal(seen, shown)
 
 
 pytest.importorskip("ale_py.vector_env")
