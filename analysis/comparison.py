@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daedalus.analysis.recorded_run import RATING
+from daedalus.analysis.recorded_run import RATING, RecordedRun
 from daedalus.analysis.run_groups import Group, environment_of
 from daedalus.analysis.statistics import (
     Strata,
@@ -56,6 +56,7 @@ class Comparison:
     other_task: bool = False  # whether a run trains on another task than that of evaluations
     rated: bool = False  # whether a run is a game with opponents
     incomparable: str = ""  # why the final returns are not compared
+    played: Sequence[str] = ()  # how the final evaluations were played, such as "greedy on gymnasium"
     unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in their names
 
 
@@ -103,6 +104,7 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
         other_task=other_task,
         rated=any(not np.isnan(run.metrics.get(RATING, np.nan)).all() for run in runs),
         incomparable=problem,
+        played=sorted({how_played(run) for run in runs} - {""}) if evaluated else (),
     )
 
 
@@ -131,6 +133,12 @@ def incomparable_returns(groups: Sequence[Group]) -> str:
         "environment.no_reward_limit or lessons) and not all runs were evaluated; evaluate them, such as with: "
         f"{without[0].record_command}"
     )
+
+
+def how_played(run: RecordedRun) -> str:
+    """Return the actions and the backend of the final evaluation of a run; empty if they are not known."""
+    found = run.summary.get("evaluation")
+    return f"{found.get('actions')} on {found.get('backend')}" if isinstance(found, dict) else ""
 
 
 def final_returns(group: Group, *, evaluated: bool) -> np.ndarray:
@@ -219,6 +227,8 @@ def notes(comparison: Comparison) -> list[str]:
             "games with opponents: what one side wins, the other loses, so that returns of self-play say nothing about "
             "the strength of play; let the policies play: daedalus evaluate RUN --against RUN2"
         )
+    if len(comparison.played) > 1:
+        lines.append(f"the final evaluations were played in different ways: {', '.join(comparison.played)}")
     if comparison.incomparable:
         lines.append(comparison.incomparable)
     elif any(math.isnan(result.final_return.value) for result in comparison.results):

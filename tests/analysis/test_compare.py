@@ -1,6 +1,7 @@
 """Test of `daedalus compare`."""
 
 import csv
+import json
 import re
 from pathlib import Path
 
@@ -73,6 +74,18 @@ def test_runs_without_an_evaluation_are_compared_by_their_training(
     assert "475.0 [470.0, 480.0]" in output
     assert "final return: mean of the last training episodes" in output
     assert "never" in output  # a half of the runs did not reach the target
+
+
+def test_evaluations_with_other_actions_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed, (name, actions) in enumerate({"a": "greedy", "b": "sampled"}.items()):
+        path = record(folder / name, seed=seed) / "summary.json"
+        path.write_text(
+            json.dumps(json.loads(path.read_text()) | {"evaluation": {"actions": actions, "backend": "ale"}})
+        )
+    assert compare(["a", "b"]) == 0
+    assert "played in different ways: greedy on ale, sampled on ale" in capsys.readouterr().out
+    assert compare(["a"]) == 0
+    assert "different ways" not in capsys.readouterr().out
 
 
 def test_a_threshold_is_reached_by_evaluations_where_training_plays_another_task(
