@@ -101,7 +101,7 @@ class RunProcesses:
     def stop(self) -> None:
         """End all processes and their children: those that obey SIGTERM, and the others after a few seconds."""
         processes = [running.process for running in self._running]
-        stop(processes, _GRACE_SECONDS)
+        stop(processes, grace_seconds=_GRACE_SECONDS)
         _end_groups([process.pid for process in processes])
         self.collect()
 
