@@ -275,6 +275,13 @@ class CheckpointMismatchError(Exception):
     """Error for a checkpoint of another network or optimiser."""
 
 
+_OUTPUTS = {  # of a network, by the heads of the algorithm
+    "policy_and_value": "a policy and values",
+    "action_values": "action values",
+    "policy": "a policy without values",
+}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Beginning:
     """What the policy of a learner process begins with: a checkpoint, the weights of another run, or neither."""
@@ -317,6 +324,12 @@ class Beginning:
 
     def _check_initial(self, initial: SavedPolicy, spec: RunSpec, spaces: Spaces) -> None:
         """Raise CheckpointMismatchError if the policy of another run means something else in this one."""
+        there, here = initial.spec.training, spec.training
+        if there.record.heads != here.record.heads:  # the weights may fit all the same
+            raise CheckpointMismatchError(
+                f"{there.algorithm} learned {_OUTPUTS[there.record.heads]}, and {here.algorithm} learns "
+                f"{_OUTPUTS[here.record.heads]}: name a run of an algorithm that learns the same"
+            )
         if difference := other_network(initial, spec.policy, spaces):
             raise CheckpointMismatchError(difference)
         difference = other_spaces(initial, spec.environment, spaces)

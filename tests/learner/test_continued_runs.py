@@ -7,9 +7,12 @@ from typing import Any
 
 import pytest
 from building import run_spec
+from saved_runs import CARTPOLE, save
 
 from daedalus.learner.run.counters import Annealing, RunCounters
 from daedalus.learner.run.resuming import (
+    Beginning,
+    CheckpointMismatchError,
     FinishedRun,
     allows_other_spaces,
     finished_run,
@@ -19,7 +22,8 @@ from daedalus.learner.run.resuming import (
 )
 from daedalus.learner.run.run_directory import create_locked, write_json
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.saving.saved_policy import FORMAT, SavedPolicy
+from daedalus.learner.training.learner import Learner
+from daedalus.policy.saving.saved_policy import FORMAT, SavedPolicy, find_policy
 from daedalus.policy.saving.sealed import write_sealed
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EvaluationSpec, RunSpec
@@ -264,6 +268,20 @@ def test_network_of_equal_shapes_differs_by_what_it_computes(
     found = other_network(saved(policy=before), saved(policy=now).spec.policy, saved().spaces)
     assert found.startswith(difference)
     assert bool(found) == bool(difference)
+
+
+@pytest.mark.parametrize(("before", "now"), [("sac", "n_step_q"), ("n_step_q", "sac")])
+def test_probabilities_and_action_values_are_not_taken_for_each_other(tmp_path: Path, before: str, now: str) -> None:
+    """With one discrete action their weights have the same names and shapes."""
+    settings = {"distribution": "squashed_gaussian", "state_dependent_std": True}
+    initial, other = (
+        find_policy(save(tmp_path / name, CARTPOLE, 1, policy=settings, training={"algorithm": name}))
+        for name in (before, now)
+    )
+    learner = Learner(other.spec.training, other.spec.policy, other.spaces)
+    with pytest.raises(CheckpointMismatchError, match=rf"^--init-from .*: {before} learned .*, and {now} learns "):
+        Beginning(initial=initial).load_into(learner, other.spec, 0.0)
+    Beginning(initial=other).load_into(learner, other.spec, 0.0)
 
 
 @pytest.mark.parametrize("allowed", [True, False])
