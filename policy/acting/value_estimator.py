@@ -31,9 +31,7 @@ class ValueEstimator:
         self._network = network.eval().requires_grad_(False)
         self._discrete = {name for name, space in spaces.observations.items() if isinstance(space, DiscreteSpace)}
         # Of an algorithm of action values, the value of a state is that of its best action.
-        self._is_known = network.value_head is not None or network.distribution.parameter_count == sum(
-            space.choices for space in spaces.actions.values() if isinstance(space, DiscreteSpace) and space.size == 1
-        )
+        self._is_known = network.value_head is not None or spec.training.record.heads == "action_values"
 
     def __call__(self, observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
         """Return the value of one observation, in the scale of the rewards that the learner sees; None if unknown.

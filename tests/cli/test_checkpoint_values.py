@@ -57,6 +57,13 @@ def test_value_of_action_values_is_that_of_the_best_action(tmp_path: Path) -> No
     assert values(OBSERVATION, state_of(0)) == pytest.approx(float(outputs.max()))
 
 
+def test_the_outputs_of_a_policy_without_values_are_no_values(tmp_path: Path) -> None:
+    squashed = {"distribution": "squashed_gaussian", "state_dependent_std": True}
+    values = CheckpointValues(save(tmp_path, CARTPOLE, 3, policy=squashed, training={"algorithm": "sac"}), NO_MODULES)
+    values.refresh()
+    assert values(OBSERVATION, state_of(0)) is None
+
+
 def test_a_newer_checkpoint_is_used_and_a_damaged_one_is_not(tmp_path: Path) -> None:
     run = save(tmp_path / "run", CARTPOLE, 3, weights_seed=1)
     values = CheckpointValues(run, NO_MODULES)
