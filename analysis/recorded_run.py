@@ -21,7 +21,16 @@ from pydantic import BaseModel, Field, ValidationError
 from daedalus.analysis.run_selection import one_run
 from daedalus.learner.reporting.metrics_rows import MAX_COLUMNS, lasting
 from daedalus.learner.reporting.thinning import bounded, line_bytes
-from daedalus.learner.run.run_directory import CONFIG, EVALUATION, EVENTS, METRICS, OUTPUT, SUMMARY, VERSIONS
+from daedalus.learner.run.run_directory import (
+    CONFIG,
+    DEMONSTRATIONS,
+    EVALUATION,
+    EVENTS,
+    METRICS,
+    OUTPUT,
+    SUMMARY,
+    VERSIONS,
+)
 from daedalus.learner.run.run_files import RunDataError, read_end, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
@@ -32,7 +41,7 @@ from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.texts import bounded_text
 
-SEED, ENVIRONMENT = "training.seed", "environment.id"
+SEED, ENVIRONMENT, BEGUN_WITH = "training.seed", "environment.id", "begun_with"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
 RATING = "rating"  # of the newest policy, in games with opponents
 EVALUATION_RETURN = "evaluation_return_mean"  # during training
@@ -61,12 +70,15 @@ class RecordedRun:
     # Columns of metrics.csv, [rows]; NaN: no value. Without rows that a resumed run has undone.
     metrics: Mapping[str, np.ndarray]
     summary: Mapping[str, Any]  # summary.json; empty before the end of training
+    begun_with: str | None = None  # besides its settings: `weights` of another run, `demonstrations`, or both
 
     def setting(self, path: str) -> Any:
         """Return a setting, or the part of one that is a table, such as `environment.kwargs.size`; None if unset.
 
-        A part that is None is "none".
+        A part that is None is "none". BEGUN_WITH is no setting, but tells runs apart as those do.
         """
+        if path == BEGUN_WITH:
+            return self.begun_with
         section, *keys = path.split(".")
         value = self.settings.get(".".join((section, *keys[:1])))
         for key in keys[1:]:
@@ -196,7 +208,15 @@ def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
         settings=read_run_settings(directory),
         metrics=_metrics(directory, (ENV_STEPS, RETURN, *columns)),
         summary=_summary(directory / SUMMARY),
+        begun_with=_begun_with(directory),
     )
+
+
+def _begun_with(directory: Path) -> str | None:
+    found = ["demonstrations"] if (directory / DEMONSTRATIONS).is_dir() else []
+    with suppress(RunDataError):  # without the file, or if it is damaged, it is not known
+        found += ["weights"] if (read_json(directory / VERSIONS) or {}).get("init_from") else []
+    return " and ".join(found) or None
 
 
 def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
@@ -422,6 +442,7 @@ def read_record(directory: Path, columns: Sequence[str] = ()) -> RunRecord:
         settings=run.settings,
         metrics=run.metrics,
         summary=run.summary,
+        begun_with=run.begun_with,
         evaluation=_evaluation(run),
         confirmation=confirmation if isinstance(confirmation, dict) else {},
         versions={name: str(value) for name, value in versions.items() if value is not None},

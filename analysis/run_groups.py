@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from daedalus.analysis.recorded_run import ENVIRONMENT, SEED, RecordedRun, read_run
+from daedalus.analysis.recorded_run import BEGUN_WITH, ENVIRONMENT, SEED, RecordedRun, read_run
 from daedalus.analysis.run_selection import find_runs
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.settings import value_text
@@ -79,7 +79,7 @@ def _identity(run: RecordedRun, keys: Sequence[str] = ()) -> str:
     if not run.settings:
         return str(run.directory)
     relevant = {key: value for key, value in run.settings.items() if key in keys or _is_relevant(key)}
-    return json.dumps(relevant, sort_keys=True)
+    return json.dumps({**relevant, BEGUN_WITH: run.begun_with}, sort_keys=True)
 
 
 def _is_relevant(key: str) -> bool:
@@ -93,7 +93,7 @@ def _differing(groups: Sequence[Sequence[RecordedRun]]) -> list[str]:
     if len(groups) < 2 or not all(run.settings for run in runs):
         return []
     known = {part for run in runs for key in run.settings if _is_relevant(key) for part in _parts(key, runs)}
-    differing = [key for key in known if len({_text(group, key) for group in groups}) > 1]
+    differing = [key for key in (*known, BEGUN_WITH) if len({_text(group, key) for group in groups}) > 1]
     differing.sort(key=lambda key: (_FIRST.index(key) if key in _FIRST else len(_FIRST), key))
     for count in range(1, _MOST_TELLING + 1):
         for keys in itertools.combinations(differing, count):

@@ -1,5 +1,6 @@
 """Test of analysis/run_groups.py."""
 
+import json
 from pathlib import Path
 
 from recorded_runs import record
@@ -21,6 +22,20 @@ def names(*runs: RecordedRun) -> list[tuple[str, list[str]]]:
 def test_seeds_of_one_setting_are_one_group(tmp_path: Path) -> None:
     runs = [run(tmp_path, f"s{seed}", seed=seed) for seed in (1, 2)]
     assert names(*runs) == [("CartPole-v1, impala", ["s1", "s2"])]
+
+
+def test_runs_from_weights_or_demonstrations_are_no_seeds_of_those_from_nothing(tmp_path: Path) -> None:
+    """Runs that began with the weights of different runs are: each seed may go on from its own."""
+    for seed in range(1, 5):
+        record(tmp_path / f"s{seed}", seed=seed)
+    for seed in (2, 3):
+        (tmp_path / f"s{seed}" / "versions.json").write_text(json.dumps({"init_from": f"/runs/first-{seed}"}))
+    (tmp_path / "s4" / "demonstrations").mkdir()
+    assert sorted(names(*(read_run(tmp_path / f"s{seed}") for seed in range(1, 5)))) == [
+        ("begun_with=demonstrations", ["s4"]),
+        ("begun_with=unset", ["s1"]),
+        ("begun_with=weights", ["s2", "s3"]),
+    ]
 
 
 def test_settings_of_the_service_make_no_groups_unless_they_are_named(tmp_path: Path) -> None:
