@@ -57,6 +57,7 @@ class Comparison:
     rated: bool = False  # whether a run is a game with opponents
     incomparable: str = ""  # why the final returns are not compared
     played: Sequence[str] = ()  # how the final evaluations were played, such as "greedy on gymnasium"
+    stopped: int = 0  # number of runs that were stopped before their end, and evaluated all the same
     unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in their names
 
 
@@ -104,6 +105,7 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
         other_task=other_task,
         rated=any(not np.isnan(run.metrics.get(RATING, np.nan)).all() for run in runs),
         incomparable=problem,
+        stopped=sum(run.summary.get("finished") is False and run.evaluation_return is not None for run in runs),
         played=sorted({how_played(run) for run in runs} - {""}) if evaluated else (),
     )
 
@@ -227,6 +229,8 @@ def notes(comparison: Comparison) -> list[str]:
             "games with opponents: what one side wins, the other loses, so that returns of self-play say nothing about "
             "the strength of play; let the policies play: daedalus evaluate RUN --against RUN2"
         )
+    if comparison.stopped:
+        lines.append(f"{comparison.stopped} of the runs were stopped before their end, and evaluated all the same")
     if len(comparison.played) > 1:
         lines.append(f"the final evaluations were played in different ways: {', '.join(comparison.played)}")
     if comparison.incomparable:

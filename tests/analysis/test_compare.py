@@ -88,6 +88,15 @@ def test_evaluations_with_other_actions_are_named(folder: Path, capsys: pytest.C
     assert "different ways" not in capsys.readouterr().out
 
 
+def test_a_run_that_was_stopped_and_evaluated_is_counted(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(folder / "a", seed=1)
+    record(folder / "b", seed=2, finished=False, evaluation=3.0)
+    assert compare(["a", "b"]) == 0
+    assert "1 of the runs were stopped before their end" in capsys.readouterr().out
+    assert compare(["a"]) == 0
+    assert "stopped" not in capsys.readouterr().out
+
+
 def test_a_threshold_is_reached_by_evaluations_where_training_plays_another_task(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
