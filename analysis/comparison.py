@@ -105,7 +105,7 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
         other_task=other_task,
         rated=any(not np.isnan(run.metrics.get(RATING, np.nan)).all() for run in runs),
         incomparable=problem,
-        stopped=sum(run.summary.get("finished") is False and run.evaluation_return is not None for run in runs),
+        stopped=sum(run.was_stopped and run.evaluation_return is not None for run in runs),
         played=sorted({how_played(run) for run in runs} - {""}) if evaluated else (),
     )
 

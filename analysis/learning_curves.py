@@ -92,7 +92,7 @@ def _group_series(name: str, runs: Sequence[RecordedRun], column: str, by: str) 
         return None
     begin = max(x[0] for x, _ in lines)
     last = [x[-1] for x, _ in lines]
-    running = [end for end, run in zip(last, runs, strict=True) if run.unfinished]
+    running = [end for end, run in zip(last, runs, strict=True) if run.unfinished or run.was_stopped]
     end = min([max(last), *running])
     if end < begin:
         return None

@@ -106,6 +106,11 @@ class RecordedRun:
         return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps){stopped}: {remedy}"
 
     @property
+    def was_stopped(self) -> bool:
+        """Whether training was stopped before its end. The run may have been evaluated all the same."""
+        return self.summary.get("finished") is False
+
+    @property
     def resume_command(self) -> str:
         """Command that continues the run."""
         modules = {} if self.spec is None else self.spec.user_modules

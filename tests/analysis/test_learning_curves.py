@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from recorded_runs import record
 
 from daedalus.analysis.learning_curves import Series, evaluations, points, series_of
@@ -60,8 +61,9 @@ def test_a_finished_run_keeps_its_last_value(tmp_path: Path) -> None:
     assert curve.y[-1] == 15.0
 
 
-def test_the_curve_ends_where_an_unfinished_run_ends(tmp_path: Path) -> None:
-    running = run(tmp_path, "a", returns=(0.0, 10.0), env_steps=(0, 100), finished=False, evaluation=None)
+@pytest.mark.parametrize("evaluation", [None, 3.0])  # a run that was stopped may be evaluated
+def test_the_curve_ends_where_an_unfinished_run_ends(tmp_path: Path, evaluation: float | None) -> None:
+    running = run(tmp_path, "a", returns=(0.0, 10.0), env_steps=(0, 100), finished=False, evaluation=evaluation)
     curve = group_curve(running, run(tmp_path, "b"))
     assert curve is None  # the other one has its first value at 1,000
     curve = group_curve(running, run(tmp_path, "c", returns=(0.0, 8.0), env_steps=(0, 200)))
