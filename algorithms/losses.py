@@ -91,17 +91,15 @@ class _SurrogateLoss(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         ratios = log_ratios.clamp(max=_MAX_LOG_RATIO).exp()
         clipped = ratios.clamp(1.0 - clip_range, 1.0 + clip_range)
-        gains, too_large = ratios * factors, log_ratios > _MAX_LOG_RATIO
+        gains, without_gradient = ratios * factors, log_ratios > _MAX_LOG_RATIO
         if is_spo:
             changes = (ratios - 1.0) / clip_range
             objective = gains.addcmul(factors.abs() * changes, ratios - 1.0, value=-0.5)
-            slopes = ratios * (factors - factors.abs() * changes)  # by the logarithm
+            slopes = ratios * (factors - factors.abs() * changes)  # by the logarithm of the ratio
         else:
-            objective, slopes = gains.minimum(clipped * factors), gains
-            # The rows that have a gradient: those whose ratio is not clipped, for which it is also that of the
-            # logarithm.
-            too_large = too_large | (gains > objective)
-        ctx.save_for_backward((slopes * shares).masked_fill_(too_large, 0.0))
+            objective, slopes = gains.minimum(clipped * factors), gains  # a ratio is its own slope by the logarithm
+            without_gradient |= gains > objective  # rows whose ratio is clipped
+        ctx.save_for_backward((slopes * shares).masked_fill_(without_gradient, 0.0))
         outside = mean((ratios != clipped).to(shares.dtype), shares)
         ctx.mark_non_differentiable(outside)
         return -mean(objective, shares), outside

@@ -114,9 +114,8 @@ def train(
         finally:
             ask_to_end(learner.process)
             stop([actor.process for actor in actors], [each.process for each in inference])
-            stop(
-                [learner.process], grace_seconds=LEARNER_GRACE_SECONDS
-            )  # where the disk is slow, it takes longer than the others
+            # Where the disk is slow, it takes longer than the others.
+            stop([learner.process], grace_seconds=LEARNER_GRACE_SECONDS)
 
 
 @contextmanager
