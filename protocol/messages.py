@@ -18,7 +18,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.league import LeagueStatus, Plan
 from daedalus.protocol.lessons import LessonPlan
 from daedalus.protocol.models import Specification
-from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spaces import ComponentOrder, Spaces
 from daedalus.protocol.spec import ActorSpec
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import EPISODE_DTYPES, Gradient, Rollout
@@ -333,6 +333,7 @@ class Welcome:
     # For an evaluator: episodes to play at once with each policy, with this seed; 0: as the specification says.
     play_episodes: int = 0
     play_seed: int = 0
+    order: ComponentOrder | None = None  # of the components in the learner's network; None until the spaces are known
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.epsilon <= 1.0:

@@ -5,7 +5,7 @@ The environment's nested spaces are flattened to components, and actions back (a
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import FailFast, Field, StringConstraints, field_validator, model_validator
@@ -277,6 +277,13 @@ ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]  # by component
 ActionSpace = Annotated[DiscreteSpace | ContinuousSpace, Field(discriminator="kind")]
 
 
+class ComponentOrder(Specification):
+    """The order in which a network reads and returns the components of spaces: places among their sorted names."""
+
+    observations: Annotated[tuple[int, ...], Field(max_length=_MAX_COMPONENTS)]
+    actions: Annotated[tuple[int, ...], Field(max_length=_MAX_COMPONENTS)]
+
+
 class Spaces(Specification):
     """Observation and action space of an environment; actors report them, and the learner checks that all agree.
 
@@ -311,6 +318,24 @@ class Spaces(Specification):
             for name, space in self.actions.items()
             if isinstance(space, DiscreteSpace) and space.masked
         }
+
+    @property
+    def order(self) -> ComponentOrder:
+        """The order of the components, which equal spaces may list in another one."""
+        listed = [*self.observations], [*self.actions]
+        observations, actions = (tuple(map(sorted(names).index, names)) for names in listed)
+        return ComponentOrder(observations=observations, actions=actions)
+
+    def in_order(self, order: ComponentOrder) -> "Spaces":
+        """Return the same spaces with their components in an order. Raises ValueError if it has other components."""
+        update: dict[str, Any] = {}
+        for kind in ("observations", "actions"):
+            spaces, places = getattr(self, kind), getattr(order, kind)
+            if sorted(places) != list(range(len(spaces))):
+                raise ValueError(f"{list(places)} is no order of {len(spaces)} {kind}")
+            names = sorted(spaces)
+            update[kind] = {names[place]: spaces[names[place]] for place in places}
+        return self.model_copy(update=update)
 
     @property
     def only_choice(self) -> DiscreteSpace | None:

@@ -282,7 +282,7 @@ class ActorSession(PolicySession):
             self.feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self.config.name, count, spec.environment.id)
         program = None if self.config.runtime == "torch" else (yield from self.await_program(welcome))
-        yield Begin(welcome, spaces, count, program)
+        yield Begin(welcome, _as_the_learner(spaces, welcome), count, program)
         if spec.algorithm.synchronous:
             self.feed.subscribe()
         yield from self._collect_and_upload(spec)
@@ -425,6 +425,16 @@ class ActorSession(PolicySession):
                 _MANY_REJECTIONS,
                 in_flight.reason,
             )
+
+
+def _as_the_learner(spaces: Spaces, welcome: Welcome) -> Spaces:
+    """Return an actor's spaces with the components in the learner's order, that of a network's inputs and outputs."""
+    if welcome.order is None:  # the learner is an older one
+        return spaces
+    try:
+        return spaces.in_order(welcome.order)
+    except ValueError as error:
+        raise ActorError(f"the learner's Welcome does not fit the spaces of the environment: {error}") from None
 
 
 def _check_size(payload: bytes, spec: ActorSpec) -> None:

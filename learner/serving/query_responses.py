@@ -173,6 +173,7 @@ class JoinResponses:
                 self.postponed_at = now if refusal.code == "name_taken" else self.postponed_at
             seed, epsilon = fleet.seed_for(name, self._context.start_version), fleet.epsilon_for(name)
             is_new = fleet.incarnation_number(name) != before
+            order = None if fleet.spaces is None else fleet.spaces.order
         if refusal is not None:
             self.preparing = "" if self.preparing == name else self.preparing
             self._add_refusal(name, origin, refusal)
@@ -188,6 +189,7 @@ class JoinResponses:
             epsilon=epsilon,
             spec=self._spec,
             software=own_release(),
+            order=order,
         )
         return encode(welcome)
 

@@ -3,14 +3,19 @@
 import io
 import json
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 import safetensors.numpy
 from processes import LIMIT, Running, until
 
+from daedalus.actor.environments.make import make_environments
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.actor_service import ActorService
 from daedalus.learner.reporting.metrics_rows import Details
@@ -25,6 +30,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import STATUS_LIMITS
 from daedalus.protocol.messages import StatusReport
+from daedalus.protocol.spaces import ComponentOrder, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -45,11 +51,19 @@ class Rows:
 class RunningLearner:
     """A learner on a thread."""
 
-    def __init__(self, network: MemoryNetwork, spec: RunSpec, directory: Path, *, resume: bool = False) -> None:
+    def __init__(
+        self,
+        network: MemoryNetwork,
+        spec: RunSpec,
+        directory: Path,
+        spaces: Spaces | None = None,
+        *,
+        resume: bool = False,
+    ) -> None:
         self.stop, self.rows, self.outcomes = threading.Event(), Rows(), list[Outcome]()
         self._transport = MemoryTransport(network)
         restored = load_newest(directory) if resume else None
-        context = RunContext.begin(directory, spec, self.stop, restored=restored)
+        context = RunContext.begin(directory, spec, self.stop, spaces=spaces, restored=restored)
         progress = Progress(io.StringIO(), spec.training.env_steps)
         outputs = Outputs(progress=progress, writers=[lambda: self.rows])
         service = LearnerService(context, self._transport, outputs, Beginning(restored=restored))
@@ -124,12 +138,12 @@ NORMALIZATION = (
 GRADIENTS = "collection.upload=gradients"
 
 
-def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
+def train_in_one_process(spec: RunSpec, directory: Path, spaces: Spaces | None = None) -> Outcome:
     """Train with learner and actors as threads of this process, over the memory transport."""
     network = MemoryNetwork()
     run_directory.create(directory, spec)
     with playing(network, spec.collection.actors):
-        return RunningLearner(network, spec, directory).join()
+        return RunningLearner(network, spec, directory, spaces).join()
 
 
 def checkpoint_files(directory: Path) -> dict[str, bytes]:
@@ -151,6 +165,51 @@ def test_one_actor_gives_equal_weights_with_rollouts_and_with_gradients(tmp_path
     override(settings, ("training.seed=2",))  # the tests of this file can fail: the weights depend on the seed
     train_in_one_process(run_spec(settings), tmp_path / "other")
     assert checkpoint_files(tmp_path / "other") != equal
+
+
+class TwoParts(gymnasium.Env):
+    """Two observed numbers of which the reward depends on one, listed against the order of their names."""
+
+    observation_space = gymnasium.spaces.Dict(
+        OrderedDict((name, gymnasium.spaces.Box(-1.0, 1.0, (1,))) for name in ("second", "first"))
+    )
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        return self._observe(), {}
+
+    def step(self, action: int) -> Any:
+        reward = float((self._observed["first"][0] > 0) == action)
+        return self._observe(), reward, bool(self.np_random.random() < 0.1), False, {}
+
+    def _observe(self) -> dict[str, Any]:
+        first, second = self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32)
+        self._observed = {"second": second[None], "first": first[None]}
+        return self._observed
+
+
+def test_an_actor_that_builds_the_network_reads_the_components_in_the_learners_order(tmp_path: Path) -> None:
+    gymnasium.register("TwoParts-v0", lambda **_: TwoParts(), max_episode_steps=100)
+    try:
+        settings = {"environment": {"id": "TwoParts-v0"}, "training": {"algorithm": "a2c", "env_steps": 3000}}
+        override(settings, ("collection.actors=1", "evaluation.final_episodes=0"))
+        with closing(make_environments(run_spec(settings).environment, 1)) as environments:
+            here = environments.spaces
+        assert here.order == ComponentOrder(observations=(1, 0), actions=(0,))
+        there = here.in_order(ComponentOrder(observations=(0, 1), actions=(0,)))
+        assert [*there.observations] == ["first", "second"]
+        train_in_one_process(run_spec(settings), tmp_path / "rollouts", there)
+        override(settings, (GRADIENTS,))
+        train_in_one_process(run_spec(settings), tmp_path / "gradients", there)
+    finally:
+        gymnasium.registry.pop("TwoParts-v0")
+    with_rollouts, with_gradients = (
+        safetensors.numpy.load(checkpoint_files(tmp_path / upload)["parameters.safetensors"])
+        for upload in ("rollouts", "gradients")
+    )
+    for name, weights in with_rollouts.items():
+        np.testing.assert_allclose(with_gradients[name], weights, atol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("change", ["training.curiosity=0.5", GRADIENTS], ids=["rollouts", "gradients"])

@@ -46,7 +46,7 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ComponentOrder, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.uploads import Gradient, Rollout, RolloutIdentity
 
@@ -154,6 +154,7 @@ MESSAGES: dict[str, Message] = {
         software="daedalus-rl 1.2.3",
         seed=3,
         epsilon=0.125,
+        order=ComponentOrder(observations=(1, 0), actions=(0,)),
         spec=RunSpec(
             environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}, training_kwargs={"b": 2.5})
         ).for_actors(),
