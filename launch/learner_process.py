@@ -250,6 +250,8 @@ class LearnerProcess:
         options = self._options
         if run.exists and options.prepared is None:  # the launcher of a prepared run has locked it
             stack.enter_context(RunLock(run.directory))
+        if run.exists:
+            stack.push(partial(_restore_config, run.directory))
         if options.new.directory is not None:
             stack.enter_context(run_directory.made(run.directory))  # before a router is waited for, for status --alive
         Heartbeat(run.directory).clear()
@@ -266,7 +268,7 @@ class LearnerProcess:
         restored = _newest_checkpoint(run.directory) if resumed else None
         if run.changed:  # only now: a run that cannot go on stays as it was
             _logger.info("settings of the run changed: %s", ", ".join(run.changed))
-            run_directory.write_config(run.directory, run.spec)
+            run_directory.change_config(run.directory, run.spec)
         spaces = options.spaces
         if restored is None and options.prepared is None:
             run, spaces = self._with_spaces(run)
@@ -418,6 +420,12 @@ def _note_superseded(directory: Path, learner_epoch: int) -> None:
         run_directory.note_superseded(directory, learner_epoch)
     except OSError as error:
         _logger.error("%s cannot be written, so do not start this learner again: %s", directory, error.strerror)
+
+
+def _restore_config(directory: Path, kind: type[BaseException] | None, *_: object) -> None:
+    """Take changed settings back, if they have ended the learner before it began."""
+    if kind is not None and issubclass(kind, _FAILURES) and run_directory.restore_config(directory):
+        _logger.info("%s has the settings from before again: the run did not begin with others", run_directory.CONFIG)
 
 
 def _status(outcome: Outcome, spec: RunSpec, stopped: int, unsaved: int) -> int:

@@ -19,6 +19,7 @@ from daedalus.learner.reporting.run_reporter import RunReporter, continue_record
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.resuming import NO_WEIGHTS, Beginning
+from daedalus.learner.run.run_directory import accept_config
 from daedalus.learner.run.settings import DeviceLostError, check_rollout_length, unmeasured_target
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.events import STOPPED_BY, EventFile
@@ -139,6 +140,7 @@ class LearnerService:
                 return self._stopped_early("before the first actor joined")
             if self._cloned and self._episodes is not None:
                 self._episodes.evaluate_cloned(learner)
+            accept_config(self._context.directory)
             return self._learn(learner, checkpointer, loop)
         finally:
             self._server.close(self._why_stopped)  # unless it is closed

@@ -4,6 +4,7 @@ config.toml      all settings; reproduces the run      metrics.csv   one row for
 versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
 summary.json     result of the run                     events.*      the same metrics for TensorBoard
 learner.lock     locked by the learner that runs
+config.toml.before  the settings before those of a resumed run, until its learner begins with them
 heartbeat        its age shows that the learner works (heartbeat.py)
 events.jsonl     what happened: actors that joined and left, rejections, restarts (event_file.py)
 evaluation.json  result of the final evaluation, with the return of each episode
@@ -20,6 +21,7 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -40,6 +42,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.process_usage import available_processors
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
+CONFIG_BEFORE = "config.toml.before"  # the settings before a resumed run's, until its learner begins with those
 OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
 OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
 CONFIRMATION_OUTPUT = "confirmation.log"  # of a learner's evaluator, where the launcher writes output.log
@@ -214,6 +217,35 @@ def write_config(directory: Path, spec: RunSpec) -> None:
         replace_text(directory / CONFIG, text)
     except OSError as error:
         raise SettingsError(f"{directory / CONFIG} cannot be written: {error.strerror}") from None
+
+
+def change_config(directory: Path, spec: RunSpec) -> None:
+    """Write the settings with which a run is to continue; `restore_config` takes them back until `accept_config`.
+
+    Raises SettingsError.
+    """
+    before = directory / CONFIG_BEFORE
+    try:
+        if not before.exists():  # else a process ended in between: those are the last settings that were accepted
+            shutil.copyfile(directory / CONFIG, before)
+    except OSError as error:
+        raise SettingsError(f"{before} cannot be written: {error.strerror}") from None
+    write_config(directory, spec)
+
+
+def accept_config(directory: Path) -> None:
+    """Keep changed settings: the learner has begun with them."""
+    with suppress(OSError):  # the next change keeps the older settings beside its own, at worst
+        (directory / CONFIG_BEFORE).unlink(missing_ok=True)
+
+
+def restore_config(directory: Path) -> bool:
+    """Take changed settings back that were not accepted, and return whether there were any."""
+    try:
+        os.replace(directory / CONFIG_BEFORE, directory / CONFIG)
+    except OSError:
+        return False
+    return True
 
 
 def read_config(directory: Path) -> RunSpec:

@@ -189,9 +189,17 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
     assert newest_checkpoint(tmp_path / "run") == before
     assert (metrics(tmp_path / "run"), summary(tmp_path / "run")) == (rows, end)
 
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    config = (tmp_path / "run" / "config.toml").read_text()
+    refused = start("resume", "run", "--env-steps", 12000, "--set", "training.device=cuda")
+    assert refused.wait() == 1, refused.output
+    refused.expect("config.toml has the settings from before again")
+    assert (tmp_path / "run" / "config.toml").read_text() == config
+
     changed = ("--set", "training.learning_rate_final=0.0001", "--set", "evaluation.final_episodes=2")
     further = start("resume", "run", "--env-steps", 12000, *changed)
     assert further.wait() == 3, further.output
+    assert not (tmp_path / "run" / "config.toml.before").exists()
     result = summary(tmp_path / "run")
     assert result["env_steps"] >= 12000
     assert result["evaluation"]["episodes"] == 2
