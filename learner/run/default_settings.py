@@ -52,7 +52,7 @@ def default_settings(
         if seats == _FULL_SEATS:
             settings[section] |= values
     if seats > 1:
-        for name in ("entropy_bonus", "curiosity"):  # were not measured in games
+        for name in ("learning_rate_final", "entropy_bonus", "curiosity"):  # were not measured in games
             settings["with_memory"]["training"].pop(name, None)
     if seats > _FULL_SEATS:
         for collection in (settings["collection"], settings["with_memory"]["collection"]):
