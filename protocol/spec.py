@@ -107,7 +107,8 @@ class EnvironmentSpec(Specification):
     action_table_columns: Annotated[tuple[NaturalInt, ...], Field(min_length=1, max_length=4096)] | None = None
     """Which numbers of an action the rows of `action_table` give, from 0. The others stay continuous. Unset: all."""
     action_repeat: Annotated[int, Field(ge=1, le=64)] = 1
-    """Take each action this many times and sum the rewards; together they are one env_step."""
+    """Take each action this many times and sum the rewards; together they are one env_step. It ends early with the
+    episode, and where a mask of illegal actions forbids the action."""
     no_reward_limit: PositiveInt | None = None
     """End an episode after this many env_steps in a row without a positive reward. Learning takes the value after it as
     0, also with `bootstrap_terminations`. Not in evaluations."""

@@ -1,11 +1,11 @@
 """Bots: players of games that are code, `random` or a class of the user's module. They act on the game's own spaces."""
 
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.components import ActionComponents, batch_of_one, leaves, only_of_batch
+from daedalus.actor.environments.components import ActionComponents, batch_of_one, only_of_batch
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.actor.environments.info import MASK_KEY, Masks, mask_of_one
 from daedalus.policy.user_code import first_line, place_of, print_traceback
@@ -116,19 +116,15 @@ class LegalActions:
 
     def __init__(self, space: gymnasium.Space) -> None:
         """Construct from the space of one agent's actions. Raises EnvironmentSetupError if it is not supported."""
-        self._space, self._components, self._leaves = space, ActionComponents(space), leaves(space, "action")
+        self._space, self._components = space, ActionComponents(space)
         self._masks: Masks | None = None  # known with the first one
 
     def allow(self, action: Any, action_mask: Any) -> bool:
         """Return whether a mask allows an action of the space. Raises EnvironmentSetupError for an unfit mask."""
         masks = self._by_component(action_mask)
-        for leaf in self._leaves:
-            if leaf.name in masks:
-                counts = cast(DiscreteSpace, self._components.spaces[leaf.name]).counts
-                choices = (leaf.of(action) - getattr(leaf.space, "start", 0)).ravel() + np.cumsum((0, *counts[:-1]))
-                if not masks[leaf.name][0, choices].all():
-                    return False
-        return True
+        if self._masks is None:
+            return True
+        return self._masks.allow(self._components.policy_actions(batch_of_one(self._space, action)), masks)
 
     def sample(self, action_mask: Any, random: np.random.Generator) -> Any:
         """Return a legal action, each with the same probability. Raises EnvironmentSetupError if there is none."""

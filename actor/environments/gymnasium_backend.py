@@ -27,6 +27,7 @@ from daedalus.actor.environments.gymnasium_environments import EnvironmentsInTur
 from daedalus.actor.environments.info import has_choices
 from daedalus.actor.environments.parameters import WithParameters
 from daedalus.actor.environments.rendering import CountedSteps, render_without_display
+from daedalus.actor.environments.transforms import LegalRepeats
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules, object_of
@@ -93,6 +94,9 @@ class EnvironmentFactory:
             environment = WithParameters(environment, spec.id, spec.parameters)
         if environment.has_wrapper_attr("action_masks"):
             environment = MaskInInfo(environment)
+        masks = {}
+        if spec.action_repeat > 1 and has_choices(environment.action_space, spec):
+            masks["is_legal"] = LegalRepeats(spec, environment.observation_space, environment.action_space)
         if spec.action_repeat > 1 or spec.no_reward_limit is not None or self.camera is not None:
             environment = RepeatedSteps(
                 environment,
@@ -101,6 +105,7 @@ class EnvironmentFactory:
                 no_reward_limit=spec.no_reward_limit,
                 camera=self.camera,
                 below=below,
+                **masks,
             )
         if late_rendered:
             from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages

@@ -91,6 +91,14 @@ class Masks:
             )
         return {name: self._checked(name, given.get(name), needed) for name in self._names}
 
+    def allow(self, actions: Mapping[str, np.ndarray], masks: Mapping[str, np.ndarray]) -> bool:
+        """Return whether masks {name: [1, choices]} allow an action, whose components are {name: [1, D]}."""
+        for name, mask in masks.items():
+            firsts = np.cumsum((0, *self._spaces[name].counts[:-1]))
+            if not mask[0, firsts + actions[name][0]].all():
+                return False
+        return True
+
     def _by_component(self, action_mask: Any) -> dict[str, np.ndarray]:
         """Return masks {name: [E, choices]} bool from a map by component, or one array over all their choices."""
         if isinstance(action_mask, dict):

@@ -297,6 +297,42 @@ class Transforms:
         return only_of_batch(self._action_space, self._actions.env_actions(actions))
 
 
+class LegalRepeats:
+    """Whether an action is still legal after a step of one environment, which may show another mask."""
+
+    def __init__(
+        self, spec: EnvironmentSpec, observation_space: gymnasium.Space, action_space: gymnasium.Space
+    ) -> None:
+        """Construct from the transforms, and the spaces of the environment, some of whose actions are choices.
+
+        Raises EnvironmentSetupError for spaces that do not fit the transforms, as Transforms does.
+        """
+        self._action_space, self._actions = action_space, _actions(spec, action_space)
+        seen = without(observation_space, spec.leave_out)
+        parts = seen.spaces if isinstance(seen, gymnasium.spaces.Dict) else {}
+        self._mask_space = gymnasium.spaces.Dict({name: part for name, part in parts.items() if name == MASK_KEY})
+        self._observed_masks = ObservedMasks(observation_components(seen), self._actions.spaces)
+        self._masks: Masks | None = None  # known with the first one
+
+    def __call__(self, action: Any, observation: Any, info: Mapping[str, Any]) -> bool:
+        """Return whether `action` may be taken again, after a step that returned `observation` and `info`.
+
+        Where nothing is legal there is nothing to choose, and the action goes on. Raises EnvironmentSetupError for a
+        mask that does not fit.
+        """
+        mask = info.get(MASK_KEY)
+        if self._observed_masks:
+            mask = self._observed_masks.of(batch_of_one(self._mask_space, observation))
+        elif mask is not None:
+            mask = mask_of_one(mask)
+        if mask is None:
+            return True
+        if self._masks is None:
+            self._masks = Masks(self._actions.spaces, mask)
+        values = self._actions.policy_actions(batch_of_one(self._action_space, action, "the action"))
+        return self._masks.allow(values, self._masks(mask, np.zeros(1, np.bool_)))
+
+
 class TransformedEnvironment:
     """A VectorEnvironment: a backend's environments with the specification's transforms."""
 

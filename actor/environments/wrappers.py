@@ -110,16 +110,24 @@ class RepeatedSteps(gymnasium.Wrapper):
         *,
         repeat: int,
         no_reward_limit: int | None,
+        is_legal: Callable[[Any, Any, dict[str, Any]], bool] = lambda action, observation, info: True,
         camera: Camera | None = None,
         below: CountedSteps | None = None,
     ) -> None:
-        """Construct from the environment and its id, which is for errors of the camera.
+        """Construct the wrapper.
 
-        `below` is the environment without the user's wrapper, if it has one.
+        Args:
+          environment: one environment.
+          name: its id, for errors of the camera.
+          repeat: how often each action is taken.
+          no_reward_limit: see EnvironmentSpec.
+          is_legal: whether an action may be repeated, given the observation and `info` of the step that it made.
+          camera: see make_environments.
+          below: the environment without the user's wrapper, if it has one.
         """
         super().__init__(environment)
         self._name = name
-        self._repeat = repeat
+        self._repeat, self._is_legal = repeat, is_legal
         self._no_reward_limit = no_reward_limit
         self._camera = camera
         self._below, self._skipped = below, 1  # how many steps of `below` the newest step has made
@@ -133,10 +141,10 @@ class RepeatedSteps(gymnasium.Wrapper):
         return started
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Repeat the action until the episode ends or `repeat` is reached, and sum the rewards."""
+        """Repeat the action until the episode ends, its mask forbids it or `repeat` is reached, and sum the rewards."""
         observation, total, terminated, truncated, info = self._step_once(action)
         for _ in range(self._repeat - 1):
-            if terminated or truncated:
+            if terminated or truncated or not self._is_legal(action, observation, info):
                 break
             observation, reward, terminated, truncated, info = self._step_once(action)
             total += reward

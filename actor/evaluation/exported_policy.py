@@ -16,6 +16,7 @@ import onnxruntime
 from gymnasium import spaces as gym
 
 from daedalus.actor.environments.components import Leaf, leaves
+from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.noise import NoiseSize
 from daedalus.policy.acting.runtime import action_name, mask_name, observation_name
@@ -169,8 +170,11 @@ def inputs_and_outputs(model: bytes) -> list[str]:
     """Return what an exported file takes, gives and leaves to its caller, in words."""
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     caller = json.loads(session.get_modelmeta().custom_metadata_map["daedalus.caller"])
+    repeats = f"give each action {caller['repeat_each_action']} times"
+    if any(entry.name.partition(".")[0] == MASK_KEY for entry in session.get_inputs()):
+        repeats += ", or until a mask forbids it"
     left = [
-        *([f"give each action {caller['repeat_each_action']} times"] if caller["repeat_each_action"] > 1 else []),
+        *([repeats] if caller["repeat_each_action"] > 1 else []),
         *(["show the maximum of the two newest frames"] if caller["maximum_of_two_frames"] else []),
     ]
     sides = {"inputs": session.get_inputs(), "outputs": session.get_outputs()}

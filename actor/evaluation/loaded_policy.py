@@ -12,8 +12,9 @@ import numpy as np
 from daedalus.actor.environments.atari import pools_frames
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
+from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.make import make_bare
-from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.environments.transforms import LegalRepeats, Transforms
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
 from daedalus.actor.evaluation.episodes import RunningEpisodes
 from daedalus.policy.acting.noise import Noise, draw_noise, neutral_noise
@@ -76,6 +77,8 @@ class Policy:
         self._network: ValueEstimator | None = None  # made when it is needed
         self._random = np.random.default_rng()
         self._repeat = saved.spec.environment.action_repeat
+        has_masks = self._repeat > 1 and bool(saved.spaces.masks)
+        self._may_repeat = LegalRepeats(saved.spec.environment, observation_space, action_space) if has_masks else None
         self._pools_frames = pools_frames(as_on_gymnasium(saved.spec.environment))
         self.reset()
 
@@ -92,7 +95,8 @@ class Policy:
         """Return the action for the next step of the environment: the most probable one, or a sampled one.
 
         Call it once for every step, with the newest observation, and call `reset` at the start of each episode. If the
-        run repeats actions (environment.action_repeat), an action is returned as many times before the next is chosen.
+        run repeats actions (environment.action_repeat), an action is returned as many times before the next is chosen,
+        unless a mask forbids it before.
         An Atari game must not repeat actions itself (frameskip=1): the policy observes the maximum of its two newest
         frames, as in training on the backends `ale` and `envpool`.
 
@@ -107,7 +111,7 @@ class Policy:
         self._check_mask(action_mask)
         if self._pools_frames:
             observation = self._pooled(observation)
-        if self._repeats_left == 0:
+        if self._repeats_left == 0 or not self._goes_on(observation, action_mask):
             self._action = self._choose(observation, action_mask, sampled)
             self._repeats_left = self._repeat
         self._repeats_left -= 1
@@ -205,6 +209,12 @@ class Policy:
         """Return the maximum of the newest two observations, as Atari games were observed in training."""
         before, self._frame = self._frame, np.array(frame)
         return frame if before is None or before.shape != self._frame.shape else np.maximum(before, self._frame)
+
+    def _goes_on(self, observation: Any, action_mask: Any) -> bool:
+        """Return whether the last action, which is to be repeated, is still legal."""
+        if self._may_repeat is None:
+            return True
+        return self._may_repeat(self._action, observation, {MASK_KEY: action_mask})
 
     def _check_mask(self, action_mask: Any) -> None:
         if action_mask is None and self._transforms.needs_mask:

@@ -9,6 +9,7 @@ import pytest
 from allowed_modules import TEST_MODULES
 from collectors import collect, started_collector
 from gymnasium import spaces as gym
+from gymnasium.envs.registration import EnvSpec
 from plain import PlainPolicy
 
 from daedalus.actor.checking.checker import gymnasium_notes
@@ -94,6 +95,20 @@ class Pedals(Narrowing):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
         return super().step(int(action[0]) + 1)
+
+
+class Unforbidden(Narrowing):
+    """Narrowing that takes also the actions which its mask forbids."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        return super().step(self.mask().argmax())
+
+
+class InPairs(Narrowing):
+    """Narrowing whose mask changes after two steps."""
+
+    def mask(self) -> np.ndarray:
+        return np.arange(3) == self._step // 2 % 3
 
 
 @pytest.fixture(autouse=True)
@@ -392,3 +407,30 @@ def test_choices_of_an_action_table_may_have_masks() -> None:
     assert (report.problems, report.env_steps) == ((), 20)
     with closing(make_environments(spec, 2)) as environments:
         assert environments.reset(1).masks["action"].tolist() == [[True, False, False]] * 2
+
+
+@pytest.mark.parametrize("convention", ["info", "method", "observation", "table"])
+def test_a_repeated_action_ends_where_the_mask_forbids_it(convention: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    kind, table = InPairs, None
+    if convention == "table":
+        kind, table = type("PairsOfPedals", (Pedals, InPairs), {}), ((-1.0,), (0.0,), (1.0,))
+        convention = "info"
+    monkeypatch.setitem(gymnasium.registry, "InPairs-v0", EnvSpec("InPairs-v0", lambda **kwargs: kind(**kwargs)))
+    spec = EnvironmentSpec(id="InPairs-v0", kwargs={"convention": convention}, action_repeat=4, action_table=table)
+    with closing(make_environments(spec, 2)) as environments:
+        observed, played = environments.reset(1), []
+        for _ in range(4):  # an episode of three steps, the row that only resets, and the next episode
+            choices = observed.masks["action"].argmax(1)
+            observed, rewards, *_ = environments.step({"action": choices[:, None]})
+            played.append((int(choices[0]), rewards.tolist()))
+        assert played == [(0, [2.0, 2.0]), (1, [1.0, 1.0]), (1, [0.0, 0.0]), (0, [2.0, 2.0])]
+    assert check_environment(spec, NO_MODULES, seconds=60.0, env_steps=20).problems == ()
+
+
+def test_a_repeated_action_ignores_a_mask_that_the_policy_does_not_see(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gymnasium.registry, "Free-v0", EnvSpec("Free-v0", lambda **kwargs: Unforbidden(**kwargs)))
+    kwargs: dict[str, Any] = {"convention": "observation"}
+    spec = EnvironmentSpec(id="Free-v0", kwargs=kwargs, action_repeat=4, leave_out=("action_mask",))
+    with closing(make_environments(spec, 1)) as environments:
+        environments.reset(1)
+        assert environments.step({"action": np.zeros((1, 1), np.int64)})[1] == [3.0]

@@ -170,6 +170,17 @@ def test_sampled_file_makes_its_samples_from_uniform_numbers(tmp_path: Path, nam
     assert [str(player.act(observation, sampled=True, action_mask=masks)) for _ in range(50)] == seen
 
 
+def test_policy_repeats_an_action_no_longer_than_its_mask_allows(tmp_path: Path) -> None:
+    policy = policy_of(tmp_path / "run", Case(BOARD, gym.Discrete(9), environment={"action_repeat": 3}))
+    empty = np.zeros((3, 3, 2), np.int8)
+    legal = [[2, 3], [2, 3], [3], [3, 4], [3, 4], [5], [6]]
+    played = [
+        policy.act({"observation": empty, "action_mask": np.isin(range(9), each).astype(np.int8)}) for each in legal
+    ]
+    assert [action in each for action, each in zip(played, legal, strict=True)] == [True] * 7
+    assert len(set(played[:2])) == len(set(played[2:5])) == 1
+
+
 def test_command_checks_the_file_and_says_what_is_inside(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     run, path = save(tmp_path / "run", COUNTING, 7), tmp_path / "policy.onnx"
     words = ["--check", "--licence", "MIT", "--rows", "1", "--quantize", "int8", "--episodes", "2"]
