@@ -96,11 +96,11 @@ class Vector(VectorEnv[Any, Any, Any]):
         return self._observe(), {}
 
     def step(self, actions: Any) -> Any:
-        self._steps = np.where(self._steps == 3, 0, self._steps + 1)
+        self._steps = np.where((self._steps == 3) & (self._oddity != "endless"), 0, self._steps + 1)
         kind = {"int flags": np.int64, "float flags": np.float32}.get(self._oddity, np.bool_)
         if self._oddity == "step":
             raise ValueError("no such vector")
-        ended = self._steps == 3
+        ended = (self._steps == 3) & (self._oddity != "endless")
         info = {"score": self._steps * 10 + np.arange(self.num_envs), "_score": ended.astype(kind)}
         rewards = (self._steps > 0) * 1.0
         odd: dict[str, Any] = {"reward column": rewards[:, None], "one reward": 1.0, "text": "ten"}

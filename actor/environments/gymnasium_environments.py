@@ -147,6 +147,8 @@ class GymnasiumEnvironments:
         self.observation_space: gymnasium.Space = environment.single_observation_space
         self.action_space: gymnasium.Space = environment.single_action_space
         self._read_space = without(self.observation_space, leave_out)
+        self._lengths = np.zeros(self.count, np.int64)  # of the running episodes
+        self._ended = np.zeros(self.count, np.bool_)  # whose next step only resets
         self._episode_info = EpisodeInfo()
         self._parameters: dict[int, Parameters] = {}  # of environments in processes
         # Environments that gymnasium steps one by one enter it themselves, so that the batch is made under ours.
@@ -154,6 +156,8 @@ class GymnasiumEnvironments:
         self._user_state: Callable[[], AbstractContextManager[None]] = (
             USER_STATE.watched if one_by_one else lambda: USER_STATE
         )
+        # Wrappers truncate the episodes of single environments; a vector entry point has been given the limit.
+        self._limit: int | None = None if one_by_one else environment.unwrapped.spec.kwargs.get("max_episode_steps")
         self.action_mask: Any = None
         if not has_choices:
             return
@@ -172,6 +176,7 @@ class GymnasiumEnvironments:
         except (Exception, SystemExit) as error:  # of the user's code
             raise self._failure("reset", error) from error
         self.action_mask = self._checked_info("reset", info).get(MASK_KEY)
+        self._lengths[:], self._ended = 0, np.zeros(self.count, np.bool_)
         return observations
 
     def set_parameters(self, parameters: Mapping[int, Parameters]) -> None:
@@ -201,7 +206,19 @@ class GymnasiumEnvironments:
         truncated = self._one_each("truncated", truncated, np.bool_)
         if info:
             self._episode_info.add(info, terminated | truncated)
+        if self._limit is not None:
+            self._check_lengths(self._limit, terminated | truncated)
         return observations, rewards, terminated, truncated
+
+    def _check_lengths(self, limit: int, ended: np.ndarray) -> None:
+        """Raise EnvironmentSetupError if an episode goes on at the limit: the environment has ignored it."""
+        self._lengths = np.where(self._ended, 0, self._lengths + 1)
+        self._ended = ended
+        if np.count_nonzero((self._lengths >= limit) & ~ended):
+            raise EnvironmentSetupError(
+                f"environment {self._name}: its vector entry point has got max_episode_steps={limit}, but an episode "
+                f"goes on after {limit:,} steps: return truncated there"
+            )
 
     def _checked_info(self, call: str, info: Any) -> dict[str, Any]:
         if not isinstance(info, dict):

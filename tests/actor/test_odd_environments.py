@@ -64,6 +64,7 @@ def test_flags_of_a_vector_environment_may_be_numbers_and_rewards_a_column(flags
         ("no info", "step returns info of type NoneType: it must be a dict"),
         ("complex", "reset returns an observation of type ndarray, which is not an array of numbers"),
         ("fewer rows", "reset returns 1 observations for 2 environments"),
+        ("endless", "has got max_episode_steps=20, but an episode goes on after 20 steps: return truncated there"),
         ("nan", "reset returns an observation with the value nan at index 0: it must be finite"),
     ],
 )
