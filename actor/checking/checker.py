@@ -6,6 +6,7 @@ import importlib
 import re
 import time
 import warnings
+from collections.abc import Mapping
 from contextlib import closing, suppress
 from typing import Any
 
@@ -16,12 +17,13 @@ from gymnasium.utils.env_checker import check_env
 from daedalus.actor.environments.bots import RandomActions
 from daedalus.actor.environments.components import is_text, leaves
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
+from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.gymnasium_backend import make_single, registration
-from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one
-from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, unread_mask
+from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import unfit_code
+from daedalus.protocol.spaces import DiscreteSpace, Spaces, unfit_code
 from daedalus.protocol.spec import EnvironmentSpec
 
 _RESETS, _SECONDS = 20, 2.0  # the most resets, and the time for those after the second
@@ -141,14 +143,14 @@ def own_task(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str
     only the latter. Returns an empty string also if that cannot be known within about twice `seconds`.
 
     Args:
-      spec: the environment and its transforms, without texts in its observations.
+      spec: the environment or game, and its transforms, without texts in its observations.
       modules: the modules that may be imported for it.
       seconds: for the first environment.
     """
     until, played = time.monotonic() + seconds, list[list[np.ndarray]]()
     with suppress(Exception, SystemExit):  # of the user's code; playing reports it
         for episodes in (2, 1):
-            environment = make_single(spec, modules)
+            environment = make_games(spec, 1, modules) if spec.is_game else make_single(spec, modules)
             if environment is None:
                 return ""
             with closing(environment):
@@ -163,13 +165,29 @@ def own_task(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str
             return (
                 f"environment {spec.id}: two of them with the same seed play differently, though each repeats its own "
                 "episode: its constructor draws what the seed does not decide, so that every environment of training "
-                "and of evaluations has a task of its own; draw it in reset, from self.np_random"
+                "and of evaluations has a task of its own; draw it in reset, from "
+                f"{'a generator with its seed' if spec.is_game else 'self.np_random'}"
             )
     return ""
 
 
-def _first_rows(environment: gymnasium.Env, spec: EnvironmentSpec) -> list[np.ndarray]:
+def _first_rows_of_seats(games: GameEnvironments, spec: EnvironmentSpec) -> list[np.ndarray]:
+    """Return the observations, rewards and ends of the seats that act in the first steps of a match."""
+    environments, rows = TransformedEnvironment(games, spec), list[np.ndarray]()
+    random, observed = RandomActions(environments.spaces.actions, 0), environments.reset(0)
+    for _ in range(_FIRST_STEPS):
+        rows += [frames[observed.acting].copy() for frames in observed.frames.values()]
+        if games.is_over(0):
+            break
+        observed, *outcomes = environments.step(random.choose_each(observed.masks, games.count))
+        rows += [values[observed.acting] for values in outcomes]
+    return rows
+
+
+def _first_rows(environment: gymnasium.Env | GameEnvironments, spec: EnvironmentSpec) -> list[np.ndarray]:
     """Return the observations, rewards and ends of the first steps of an episode."""
+    if isinstance(environment, GameEnvironments):
+        return _first_rows_of_seats(environment, spec)
     observation, info = environment.reset(seed=0)
     mask = info.get(MASK_KEY) if has_choices(environment.action_space, spec) else None
     example = None if mask is None else mask_of_one(mask)
@@ -191,7 +209,34 @@ def _first_rows(environment: gymnasium.Env, spec: EnvironmentSpec) -> list[np.nd
 
 
 def _alike(rows: list[np.ndarray], others: list[np.ndarray]) -> bool:
-    return all(np.allclose(row, other, rtol=1e-3, atol=1e-6) for row, other in zip(rows, others, strict=False))
+    return all(
+        row.shape == other.shape and np.allclose(row, other, rtol=1e-3, atol=1e-6)
+        for row, other in zip(rows, others, strict=False)
+    )
+
+
+STEPS_FOR_MASKS = 10  # in which `info` may have a mask that is not read
+
+
+def mask_warning(spaces: Spaces, info: Any, frames: Mapping[str, np.ndarray]) -> str:
+    """Return a warning of a mask under a name that nobody reads, or an empty string.
+
+    Args:
+      spaces: as a run has them.
+      info: of one environment, or of one agent of a game.
+      frames: its observation, by component.
+    """
+    discrete = [space for space in spaces.actions.values() if isinstance(space, DiscreteSpace)]
+    choices = sum(space.choices for space in discrete)
+    if spaces.masks or choices < 2:
+        return ""
+    for where, values in (("info", info), ("the observation", frames)):
+        if isinstance(values, Mapping) and (name := unread_mask(values, choices)):
+            return (
+                f"{name!r} of {where} seems to say which of the {choices} choices are legal, but is no mask of the "
+                f"policy: if it is one, give it as {MASK_KEY!r} from reset on, 1 for each legal choice, else 0"
+            )
+    return ""
 
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m|^WARN: ")

@@ -9,14 +9,16 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
 from daedalus.actor.checking.check_report import EnvironmentReport
+from daedalus.actor.checking.checker import STEPS_FOR_MASKS, mask_warning, own_task
 from daedalus.actor.checking.violations import observation_violations
 from daedalus.actor.environments.bots import RandomActions, make_bot
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.games import make_games
+from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.gymnasium_environments import limited_close
 from daedalus.actor.environments.roles import DifferentSpacesError
 from daedalus.actor.environments.transforms import TransformedEnvironment
+from daedalus.actor.environments.vector_environments import Observed
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
@@ -38,6 +40,7 @@ def check_game(
 
     Then each of the `bots` plays a match in all seats. The return of an episode is the mean over the agents.
     """
+    began = time.monotonic()
     try:
         modules.check(spec.user_modules)
         games = make_games(spec, 1, modules)
@@ -53,6 +56,9 @@ def check_game(
         report = report.model_copy(update=_played(environments, games, spec, seconds, env_steps, seed))
         for bot in bots:
             _play_bot(environments, games, bot, modules, seed)
+        is_slow = time.monotonic() - began > 2.0 * seconds + 1.0  # to make others could take as long
+        if not is_slow and (warning := own_task(spec, modules, seconds / 3)):
+            report = report.model_copy(update={"warnings": (*report.warnings, warning)})
         return report
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
@@ -62,7 +68,12 @@ def check_game(
 
 
 def _played(
-    environments: TransformedEnvironment, games: Any, spec: EnvironmentSpec, seconds: float, env_steps: int, seed: int
+    environments: TransformedEnvironment,
+    games: GameEnvironments,
+    spec: EnvironmentSpec,
+    seconds: float,
+    env_steps: int,
+    seed: int,
 ) -> dict[str, Any]:
     """Return the fields of the report that playing tells. Raises EnvironmentSetupError for a problem."""
     random = RandomActions(environments.spaces.actions, seed)
@@ -77,13 +88,11 @@ def _played(
     together, differ = 0, False  # steps that show several agents something new; whether they ever observe another
     until, stepping = time.monotonic() + seconds, 0.0
     while not steps or (steps < env_steps and time.monotonic() < until):
-        rows = [
-            random.choose({name: mask[[seat]] for name, mask in observed.masks.items()}) for seat in range(games.count)
-        ]
+        if steps < STEPS_FOR_MASKS and (text := _mask_warning(environments, games, observed)):
+            warnings.setdefault("a mask", f"environment {spec.id}: {text}")
+        chosen = random.choose_each(observed.masks, games.count)
         began, began_busy = time.monotonic(), time.process_time()
-        observed, rewards, terminated, truncated = environments.step(
-            {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
-        )
+        observed, rewards, terminated, truncated = environments.step(chosen)
         stepping, busy = stepping + time.monotonic() - began, busy + time.process_time() - began_busy
         assert observed.acting is not None
         assert observed.over is not None
@@ -126,7 +135,21 @@ def _played(
     }
 
 
-def _play_bot(environments: TransformedEnvironment, games: Any, bot: str, modules: UserModules, seed: int) -> None:
+def _mask_warning(environments: TransformedEnvironment, games: GameEnvironments, observed: Observed) -> str:
+    """Return a warning of a mask that no agent reads, or an empty string."""
+    assert observed.acting is not None
+    found = (
+        mask_warning(
+            environments.spaces, games.infos[seat], {name: each[seat] for name, each in observed.frames.items()}
+        )
+        for seat in np.flatnonzero(observed.acting)
+    )
+    return next(filter(None, found), "")
+
+
+def _play_bot(
+    environments: TransformedEnvironment, games: GameEnvironments, bot: str, modules: UserModules, seed: int
+) -> None:
     """Let a bot play one match, or the beginning of a long one. Raises EnvironmentSetupError for a fault of the bot."""
     for seat in range(games.count):
         games.seat_bot(seat, make_bot(bot, games.action_space, modules))
@@ -140,7 +163,7 @@ def _play_bot(environments: TransformedEnvironment, games: Any, bot: str, module
         observed, *_ = environments.step(unused)
 
 
-def _refuse_unfit(games: Any, frames: dict[str, np.ndarray], rewards: np.ndarray) -> None:
+def _refuse_unfit(games: GameEnvironments, frames: dict[str, np.ndarray], rewards: np.ndarray) -> None:
     for seat, agent in enumerate(games.agents):
         if not np.isfinite(rewards[seat]):
             raise EnvironmentSetupError(

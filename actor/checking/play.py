@@ -14,7 +14,14 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import Texts, minigrid_codes, own_task, square_maps
+from daedalus.actor.checking.checker import (
+    STEPS_FOR_MASKS,
+    Texts,
+    mask_warning,
+    minigrid_codes,
+    own_task,
+    square_maps,
+)
 from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
@@ -28,14 +35,14 @@ from daedalus.actor.environments.components import batch_of_one, only_of_batch, 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import make_single, registration, uses_vector_entry_point
 from daedalus.actor.environments.gymnasium_environments import limited_close
-from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks, unread_mask
+from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks
 from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
 from daedalus.policy.user_code import first_line, place_of, print_traceback
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces, StillObservations, unfit_number
+from daedalus.protocol.spaces import ArraySpace, Spaces, StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -132,7 +139,7 @@ def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spac
             random, until = RandomActions(spaces.actions, seed), time.monotonic() + _SECONDS
             observed = environments.reset(seed)
             for _ in range(_STEPS):
-                observed, rewards, *_ = environments.step(_chosen(random, observed.masks))
+                observed, rewards, *_ = environments.step(random.choose_each(observed.masks, _COUNT))
                 if problem := _numbers_problem(observed, rewards):
                     return f"environment {spec.id}: step returns {problem} (training uses its vector entry point)"
                 if time.monotonic() > until:
@@ -165,12 +172,6 @@ def _numbers_problem(observed: Observed, rewards: np.ndarray) -> str:
             return f"an observation whose component {name!r} {unfit}"
     faulty = ~np.isfinite(rewards)
     return f"the reward {rewards[faulty][0]}: it must be finite" if faulty.any() else ""
-
-
-def _chosen(random: RandomActions, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return an action for each environment, {name: [E, D]}, given the masks {name: [E, choices]}."""
-    rows = [random.choose({name: mask[row][None] for name, mask in masks.items()}) for row in range(_COUNT)]
-    return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
 
 
 def unsaved_statistics(environment: gymnasium.Env) -> tuple[str, ...]:
@@ -297,7 +298,6 @@ def _first_mask(environment: gymnasium.Env, seed: int) -> Any:
     return None
 
 
-_STEPS_FOR_MASKS = 10  # in which `info` may have a mask that is not read
 _MOST_PLACES = 16  # of the last axis, which is else not one of channels
 
 
@@ -427,30 +427,13 @@ class _Play:
             raise _ProblemError(str(error)) from None
         self._precision.add(observation, starts=starts)
         self._masks = observed.masks
-        if self._env_steps < _STEPS_FOR_MASKS:
-            self._look_for_masks(info, observed.frames)
+        if self._env_steps < STEPS_FOR_MASKS and (text := mask_warning(self._transforms.spaces, info, observed.frames)):
+            self._warnings.setdefault("a mask", f"{text} (--wrap MODULE:FUNCTION)")
         before, self._newest = self._newest, observed.frames
         rows = {name: np.stack([frames, observed.frames[name]])[:, None] for name, frames in before.items()}
         self._still.add(rows, np.array([[bool(before) and not (starts or over)]]))
         for name, largest in self._byte_maxima.items():
             np.maximum(largest, observed.frames[name].reshape(-1, len(largest)).max(0), out=largest)
-
-    def _look_for_masks(self, info: dict[str, Any], frames: dict[str, np.ndarray]) -> None:
-        """Warn of a mask under a name that nobody reads."""
-        spaces = self._transforms.spaces
-        discrete = [space for space in spaces.actions.values() if isinstance(space, DiscreteSpace)]
-        choices = sum(space.choices for space in discrete)
-        if spaces.masks or choices < 2:
-            return
-        seen = {"info": info, "the observation": frames}
-        for where, values in seen.items():
-            if name := unread_mask(values, choices):
-                text = (
-                    f"{name!r} of {where} seems to say which of the {choices} choices are legal, but is no mask of the "
-                    f"policy: if it is one, give it as {MASK_KEY!r} from reset on, 1 for each legal choice, else 0 "
-                    "(--wrap MODULE:FUNCTION)"
-                )
-                self._warnings.setdefault("a mask", text)
 
     def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
         try:

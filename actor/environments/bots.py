@@ -152,6 +152,11 @@ class RandomActions:
         """Return actions {name: [1, D]}, given the masks {name: [1, choices]} of the components that have masks."""
         return {name: self._values(space, masks.get(name))[None] for name, space in self._spaces.items()}
 
+    def choose_each(self, masks: dict[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
+        """Return actions {name: [count, D]} of several environments, given the masks {name: [count, choices]}."""
+        rows = [self.choose({name: mask[[row]] for name, mask in masks.items()}) for row in range(count)]
+        return {name: np.concatenate([row[name] for row in rows]) for name in self._spaces}
+
     def _values(self, space: ActionSpace, mask: np.ndarray | None) -> np.ndarray:
         match space:
             case DiscreteSpace():

@@ -76,6 +76,7 @@ class GameEnvironments:
         self._leaves = [  # each with its array of the observations of all seats
             (leaf, leaf.of(self.observations)) for leaf in leaves(read, "observation") if leaf.space.shape is not None
         ]
+        self.infos: list[Any] = [{}] * self.count  # the newest `info` of each seat, as the game gives it
         self._ended = np.zeros(self.count, np.bool_)
         self._acts = np.zeros(self.count, np.bool_)  # whether the seat has acted in this match
         self._warned = False
@@ -196,7 +197,7 @@ class GameEnvironments:
         for outcome in outcomes:
             seat = number * self.seats + self._numbers[outcome.agent]
             self._write(seat, outcome)
-            self.acting[seat] = True
+            self.acting[seat], self.infos[seat] = True, outcome.info
             if self._in_match[seat] is not None:
                 self._newest[seat] = outcome.observation, _mask(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:

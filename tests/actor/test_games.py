@@ -461,6 +461,43 @@ def test_agents_that_always_observe_the_same_are_a_warning(fields: dict[str, Any
     assert ["--set environment.agent_ids=true" in warning for warning in report.warnings] == [True] * (not fields)
 
 
+class Drawn(Board):
+    """Its constructor draws the rewards, or each reset; `info` or the observation says which choices are legal."""
+
+    def __init__(self, drawn_by: str = "", legal_in: str = "") -> None:
+        super().__init__(own=True)
+        self.drawn_by, self.legal_in, self.reward = drawn_by, legal_in, np.random.default_rng().random()
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        if self.drawn_by != "constructor":
+            self.reward = np.random.default_rng(seed if self.drawn_by == "seed" else None).random()
+        return super().reset(seed, options)
+
+    def step(self, actions: Any) -> Any:
+        seen, rewards, *rest = super().step(actions)
+        return seen, dict.fromkeys(rewards, self.reward), *rest
+
+    def _info(self) -> dict[str, dict]:
+        return {agent: {"legal_moves": [0]} if self.legal_in == "info" else {} for agent in self.possible_agents}
+
+
+@pytest.mark.parametrize(("drawn_by", "said"), [("constructor", True), ("seed", False), ("reset", False)])
+def test_a_game_whose_constructor_draws_its_task_is_a_warning(drawn_by: str, said: bool) -> None:
+    spec = EnvironmentSpec(id="test_games:Drawn", backend="pettingzoo", kwargs={"drawn_by": drawn_by})
+    report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20)
+    assert report.problems == ()
+    assert ["every environment of training and of evaluations" in each for each in report.warnings] == [True] * said
+
+
+@pytest.mark.parametrize("legal_in", ["info", ""])
+def test_a_mask_that_no_agent_reads_is_a_warning(legal_in: str) -> None:
+    spec = EnvironmentSpec(
+        id="test_games:Drawn", backend="pettingzoo", kwargs={"drawn_by": "seed", "legal_in": legal_in}
+    )
+    report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20)
+    assert ["'legal_moves' of info seems to say" in each for each in report.warnings] == [True] * bool(legal_in)
+
+
 def dark(render_mode: str) -> Duel:
     return Duel()
 
