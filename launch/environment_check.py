@@ -341,26 +341,46 @@ def transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None, *,
     return report.spaces
 
 
-def expected_spaces(spec: RunSpec, modules: UserModules, stop: threading.Event) -> Spaces | None:
+def expected_spaces(
+    spec: RunSpec, modules: UserModules, stop: threading.Event, *, is_new: bool = False
+) -> Spaces | None:
     """Return the spaces of a run's environment, or None where it cannot be made. Only makes the environment.
 
     Args:
       spec: the run.
       modules: the modules that may be imported.
       stop: ends the attempt early when it is set.
+      is_new: log what the environment and the settings of a run that begins have between them.
     """
     report = _expected(spec, modules, stop)
     if problem := report.text_problem(spec):
         _logger.info("%s", problem)
         return None
+    if is_new:
+        _log_found(report, spec)
     return report.spaces
 
 
 def expected_defaults(
-    spec: RunSpec, modules: UserModules, stop: threading.Event
+    spec_with: Callable[[dict[str, Any] | None], RunSpec], modules: UserModules, stop: threading.Event
 ) -> tuple[Spaces | None, dict[str, Any]]:
-    """Return the spaces of an environment without settings, and the default settings for it. See expected_spaces."""
-    return _defaults(_expected(spec, modules, stop, for_settings=True), spec)
+    """Return the spaces of an environment without settings, and the default settings for it.
+
+    See expected_spaces, and checked_defaults for `spec_with`.
+    """
+    spec = spec_with(None)
+    report = _expected(spec, modules, stop, for_settings=True)
+    spaces, defaults = _defaults(report, spec)
+    if spaces is not None:
+        _log_found(report, spec_with(defaults))
+        _logger.info("the environment was made and not played here: `daedalus check` looks for faults")
+    return spaces, defaults
+
+
+def _log_found(report: "EnvironmentReport", spec: RunSpec) -> None:
+    for warning in report.warnings:
+        _logger.warning("%s", warning)
+    _log_advice(report, spec)
 
 
 def _expected(

@@ -335,8 +335,8 @@ class LearnerProcess:
         """Return the run with the default settings of its spaces, and the spaces; None if they are not known here."""
         choice = self._options.new.choice
         if choice.env is None or run.exists:
-            return run, expected_spaces(run.spec, run.modules, self._stop)
-        spaces, defaults = expected_defaults(run.spec, run.modules, self._stop)
+            return run, expected_spaces(run.spec, run.modules, self._stop, is_new=not run.exists)
+        spaces, defaults = expected_defaults(choice.spec, run.modules, self._stop)
         chosen = choice.spec(defaults)
         directory = (
             run.directory if self._options.new.directory else run.directory.with_name(choice.directory(chosen).name)

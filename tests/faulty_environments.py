@@ -25,6 +25,8 @@ class Faulty(gymnasium.Env[Any, Any]):
             self.observation_space = Box(0, 255, (20, 20), np.uint8)
         if fault.endswith("board"):  # no fault
             self.observation_space = MultiBinary((10, 10, 2))
+        if fault == "photo":  # no fault
+            self.observation_space = Box(0, 255, (200, 160, 3), np.uint8)
         if fault == "driven board":
             self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         if fault == "three numbers":
@@ -53,6 +55,7 @@ class Faulty(gymnasium.Env[Any, Any]):
             "bounds": np.array([good[1], 731.5], np.float32),
             "none": None,
             "map": np.full((20, 20), self._value, np.uint8),
+            "photo": np.full((200, 160, 3), self._step % 2, np.uint8),
             "three numbers": np.zeros(3, np.float32),
             "board": np.full((10, 10, 2), self._step % 2, np.int8),
             "driven board": np.full((10, 10, 2), self._step % 2, np.int8),

@@ -90,7 +90,7 @@ def test_slow_environments_get_processes_of_their_own_unless_the_user_has_chosen
 
 def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MOST_SECONDS_FOR_SETTINGS", 0.5)
-    spaces, defaults = expected_defaults(run(faulty("hang")), MODULES, threading.Event())
+    spaces, defaults = expected_defaults(lambda _: run(faulty("hang")), MODULES, threading.Event())
     assert (spaces, defaults) == (None, default_settings(None))
     assert "the check of environment faulty_environments:Faulty-v0 was not done within 0.5 s" in LINES[-2]
     assert "the default settings are those for numbers and discrete actions" in LINES[-1]
@@ -98,7 +98,7 @@ def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize(("fault", "convolved"), [("board", True), ("driven board", False)])
 def test_a_map_is_convolved_by_default_and_that_is_said(fault: str, convolved: bool) -> None:
-    spaces, defaults = expected_defaults(run(faulty(fault)), MODULES, threading.Event())
+    spaces, defaults = expected_defaults(lambda _: run(faulty(fault)), MODULES, threading.Event())
     assert spaces is not None
     assert (defaults["policy"].get("encoder") == "grid") is convolved
     assert any("is a map of a few cells: by default policy.encoder=grid" in line for line in LINES) is convolved
@@ -190,13 +190,25 @@ def test_a_learner_expects_the_spaces_of_an_environment_that_it_can_make() -> No
     assert "may not be imported here" in LINES[-1]
 
 
+def test_a_learner_says_what_its_default_settings_remove_from_images() -> None:
+    choice = RunChoice(env="faulty_environments:Faulty-v0", assignments=["environment.kwargs.fault=photo"])
+    spaces, defaults = expected_defaults(choice.spec, MODULES, threading.Event())
+    assert spaces is not None
+    assert defaults["environment"]["grey"] is True
+    assert "is made grey and 84 x 84 pixels small for the policy" in LINES[-2]
+    assert "made and not played here" in LINES[-1]
+
+
 def mission(**settings: object) -> RunSpec:
     return run(EnvironmentSpec.model_validate({"id": "mission_environment:Mission-v0", **settings}))
 
 
 def test_default_settings_leave_out_a_text_that_never_changes() -> None:
     modules, stop = UserModules(frozenset({"mission_environment"})), threading.Event()
-    for spaces, defaults in (checked_defaults(lambda _: mission()), expected_defaults(mission(), modules, stop)):
+    for spaces, defaults in (
+        checked_defaults(lambda _: mission()),
+        expected_defaults(lambda _: mission(), modules, stop),
+    ):
         assert spaces is not None
         assert list(spaces.observations) == ["step"]
         assert defaults["environment"]["leave_out"] == ["mission"]
