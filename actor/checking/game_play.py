@@ -16,6 +16,7 @@ from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.gymnasium_environments import limited_close
+from daedalus.actor.environments.info import unreported
 from daedalus.actor.environments.roles import DifferentSpacesError
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.environments.vector_environments import Observed
@@ -112,6 +113,9 @@ def _played(
                         if kind == "problem":
                             raise EnvironmentSetupError(f"environment {spec.id}: {text}")
                         warnings.setdefault(kind, f"environment {spec.id}: {text}")
+        for seat in np.flatnonzero(terminated | truncated):
+            if text := unreported(games.infos[seat]):
+                warnings.setdefault("a number", f"environment {spec.id}: {text}")
         if observed.over[0]:
             lengths.append(length)
             returns.append(float(total.mean()))

@@ -35,7 +35,7 @@ from daedalus.actor.environments.components import batch_of_one, only_of_batch, 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import make_single, registration, uses_vector_entry_point
 from daedalus.actor.environments.gymnasium_environments import limited_close
-from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks
+from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks, unreported
 from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
@@ -403,6 +403,8 @@ class _Play:
         self._precision.add_reward(reward)
         over = bool(terminated or truncated)
         self._truncations += bool(truncated)
+        if over and (text := unreported(info)):
+            self._warnings.setdefault("a number", text)
         self._observe(observation, info, over=over)
         return float(reward), over
 

@@ -20,6 +20,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.protocol.keys import is_name
 from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER, MAX_INFO_NAMES, MAX_INFO_VALUES
 
 MASK_KEY = "action_mask"
@@ -255,6 +256,26 @@ def info_to_keep(info: dict[Any, Any], *, ended: bool) -> dict[str, Any]:
     if MASK_KEY in info:
         kept[MASK_KEY] = info[MASK_KEY]
     return kept
+
+
+def unreported(info: Any) -> str:
+    """Return which numbers of the last `info` of an episode become no metrics, and why, or an empty string."""
+    if not isinstance(info, Mapping):
+        return ""
+    scalars = [name for name, value in info.items() if isinstance(name, str) and _scalar(value) is not None]
+    unfit = [name for name in scalars if not (name.startswith("_") or is_name(name))]
+    if unfit:
+        return (
+            f"info has the number {bounded_text(unfit[0], 64)!r} at the end of an episode, which becomes no metric: "
+            "name it with at most 64 letters, digits, '.', '_' and '-'"
+        )
+    fit = [name for name in scalars if _is_scalars_name(name)]
+    if len(fit) > MAX_INFO_NAMES:
+        return (
+            f"info has {len(fit)} numbers at the end of an episode, and only {MAX_INFO_NAMES} become metrics: "
+            f"{fit[MAX_INFO_NAMES]!r} does not"
+        )
+    return ""
 
 
 def _is_scalars_name(name: Any) -> bool:

@@ -5,10 +5,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from collectors import collect, started_collector
 from counting_environment import Counting
 from plain import PlainPolicy
 
+from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.info import EpisodeInfo, info_to_keep
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -106,3 +108,29 @@ def test_rollout_has_the_scalars_of_the_episodes_that_ended_in_it(repeat: int) -
     assert found[0] == {"episode": [0.0, 0.0], "steps": [3.0, 3.0]}
     assert found[1]["episode"][:2] == [1.0, 1.0]
     assert found[1]["steps"][:2] == [2.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("info", "text"),
+    [
+        ({"laps": 1, "_hidden": 2, "eval/laps": "three"}, ""),
+        ({"laps": 1, "eval/laps": 1.5}, "info has the number 'eval/laps' at the end of an episode, which becomes no"),
+        ({"success rate": np.float32(1.0)}, "info has the number 'success rate'"),
+        ({f"n{number}": number for number in range(16)} | {"text": "no number"}, ""),
+        (
+            {f"n{number}": number for number in range(17)},
+            "17 numbers at the end of an episode, and only 16 become metr",
+        ),
+    ],
+)
+def test_the_check_names_numbers_that_become_no_metric(
+    info: dict[str, Any], text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Counting, "step", step_with(info, Counting.step))
+    spec = EnvironmentSpec(id="counting_environment:Counting-v0")
+    warnings = check_environment(spec, TEST_MODULES, seconds=60.0, env_steps=40).warnings
+    assert [text in each for each in warnings if "info has" in each] == ([True] if text else [])
+
+
+def step_with(info: dict[str, Any], step: Any) -> Any:
+    return lambda self, action: (*step(self, action)[:4], info)
