@@ -10,13 +10,14 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from daedalus.actor.checking.check_report import EnvironmentReport
 from daedalus.actor.checking.checker import STEPS_FOR_MASKS, mask_warning, own_task
-from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.checking.violations import byte_maxima, learned_reward_violations, observation_violations
 from daedalus.actor.environments.bots import RandomActions, make_bot
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.gymnasium_environments import limited_close
 from daedalus.actor.environments.info import unreported
+from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.roles import DifferentSpacesError
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.environments.vector_environments import Observed
@@ -25,6 +26,7 @@ from daedalus.protocol.spaces import StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
 _FEWEST_TOGETHER = 50  # steps of several agents after which equal observations are no chance
+_WRAPPER = "in a wrapper (--wrap)"  # which games have not
 _LOOKED_AT = 200  # steps whose observations are compared with their space: it takes longer than most steps
 
 
@@ -81,6 +83,8 @@ def _played(
     space = without(games.observation_space, spec.leave_out)
     batch = batch_space(games.observation_space, games.count)
     warnings: dict[str, str] = {}
+    precision = [Precision(space) for _ in range(games.count)]  # of each seat
+    maxima = byte_maxima(environments.spaces)
     began = time.monotonic()
     observed = environments.reset(seed)
     before, still = {name: frames.copy() for name, frames in observed.frames.items()}, StillObservations()
@@ -98,7 +102,9 @@ def _played(
         assert observed.acting is not None
         assert observed.over is not None
         steps, length, total = steps + 1, length + 1, total + rewards
-        _refuse_unfit(games, observed.frames, rewards)
+        _refuse_unfit(games, spec, observed.frames, rewards)
+        for name, largest in maxima.items():
+            np.maximum(largest, observed.frames[name].reshape(-1, len(largest)).max(0), out=largest)
         goes_on = observed.acting & ~(terminated | truncated) & (length > 0)  # no step that only resets
         still.add({name: np.stack([frames, observed.frames[name]]) for name, frames in before.items()}, goes_on[None])
         seats = np.flatnonzero(observed.acting)
@@ -109,6 +115,8 @@ def _played(
         if steps <= _LOOKED_AT:
             for seat, row in enumerate(iterate(batch, games.observations)):
                 if observed.acting[seat]:
+                    precision[seat].add(row, starts=length == 0)
+                    precision[seat].add_reward(rewards[seat])
                     for kind, text in observation_violations(space, row, "the game"):
                         if kind == "problem":
                             raise EnvironmentSetupError(f"environment {spec.id}: {text}")
@@ -120,6 +128,11 @@ def _played(
             lengths.append(length)
             returns.append(float(total.mean()))
             length, total = -1, np.zeros(games.count)  # the next step only resets
+    for seen in precision:
+        for name, text in seen.warnings.items():
+            warnings.setdefault(
+                f"precision of {name}", f"environment {spec.id}: {text.replace(_WRAPPER, 'in the game')}"
+            )
     if text := still.text(len(lengths)):
         warnings["still"] = f"environment {spec.id}: {text}"
     if together >= _FEWEST_TOGETHER and not differ:
@@ -136,6 +149,7 @@ def _played(
         "reset_seconds": reset_seconds,
         "lengths": tuple(lengths),
         "returns": tuple(returns),
+        "byte_maxima": {name: tuple(map(int, each)) for name, each in maxima.items()},
     }
 
 
@@ -167,12 +181,16 @@ def _play_bot(
         observed, *_ = environments.step(unused)
 
 
-def _refuse_unfit(games: GameEnvironments, frames: dict[str, np.ndarray], rewards: np.ndarray) -> None:
+def _refuse_unfit(
+    games: GameEnvironments, spec: EnvironmentSpec, frames: dict[str, np.ndarray], rewards: np.ndarray
+) -> None:
     for seat, agent in enumerate(games.agents):
         if not np.isfinite(rewards[seat]):
             raise EnvironmentSetupError(
                 f"environment {games.name}: {agent} has the reward {rewards[seat]}: it must be finite"
             )
+        for _, text in learned_reward_violations(float(rewards[seat]), spec):
+            raise EnvironmentSetupError(f"environment {games.name}: {agent}: {text}")
         for name, values in frames.items():
             if unfit := unfit_number(values[seat]):
                 raise EnvironmentSetupError(

@@ -25,6 +25,7 @@ from daedalus.actor.checking.checker import (
 from daedalus.actor.checking.game_play import check_game
 from daedalus.actor.checking.violations import (
     Violation,
+    byte_maxima,
     learned_reward_violations,
     observation_violations,
     reset_violations,
@@ -42,7 +43,7 @@ from daedalus.actor.environments.transforms import TransformedEnvironment, Trans
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
 from daedalus.policy.user_code import first_line, place_of, print_traceback
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
-from daedalus.protocol.spaces import ArraySpace, Spaces, StillObservations, unfit_number
+from daedalus.protocol.spaces import Spaces, StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -298,14 +299,6 @@ def _first_mask(environment: gymnasium.Env, seed: int) -> Any:
     return None
 
 
-_MOST_PLACES = 16  # of the last axis, which is else not one of channels
-
-
-def _places(space: ArraySpace) -> int:
-    """Return in how many places of the last axis the largest values are counted; 1: in all together."""
-    return space.shape[-1] if len(space.shape) == 3 and space.shape[-1] <= _MOST_PLACES else 1
-
-
 class _Play:
     """One environment in play, and what was found so far."""
 
@@ -326,11 +319,7 @@ class _Play:
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
         self._warnings = {text: text for text in unsaved_statistics(environment)}  # the first of each kind
-        self._byte_maxima = {  # the largest values seen in each place of the last axis, or in all
-            name: np.zeros(_places(each), np.uint8)
-            for name, each in transforms.spaces.observations.items()
-            if isinstance(each, ArraySpace) and each.dtype == "uint8" and len(each.shape) in (2, 3)
-        }
+        self._byte_maxima = byte_maxima(transforms.spaces)
         self._env_steps, self._resets = 0, 0
         self._step_seconds, self._busy_seconds, self._reset_seconds = 0.0, 0.0, 0.0
         self._lengths: list[int] = []

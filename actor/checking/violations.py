@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.components import LeftOut, dtype_misfit
-from daedalus.protocol.spaces import LARGEST_OBSERVATION, LARGEST_REWARD
+from daedalus.protocol.spaces import LARGEST_OBSERVATION, LARGEST_REWARD, ArraySpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
 Violation = tuple[str, str]  # "problem" or "warning", and the text
@@ -143,3 +143,15 @@ def _structure(result: Any) -> str:
     if isinstance(result, tuple):
         return f"a tuple of {len(result)} ({', '.join(type(each).__name__ for each in result)})"
     return f"one value of type {type(result).__name__}"
+
+
+_MOST_PLACES = 16  # of the last axis, which is else not one of channels
+
+
+def byte_maxima(spaces: Spaces) -> dict[str, np.ndarray]:
+    """Return zeros for the largest values of arrays of bytes: in each place of the last axis, or in all together."""
+    return {
+        name: np.zeros(space.shape[-1] if len(space.shape) == 3 and space.shape[-1] <= _MOST_PLACES else 1, np.uint8)
+        for name, space in spaces.observations.items()
+        if isinstance(space, ArraySpace) and space.dtype == "uint8" and len(space.shape) in (2, 3)
+    }

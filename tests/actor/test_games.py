@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scripted_games
 from collectors import collect, started_collector
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
@@ -496,6 +496,38 @@ def test_a_mask_that_no_agent_reads_is_a_warning(legal_in: str) -> None:
     )
     report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20)
     assert ["'legal_moves' of info seems to say" in each for each in report.warnings] == [True] * bool(legal_in)
+
+
+class Numbers(Board):
+    """It observes numbers that float32 rounds, and bytes that may be codes; the reward is an argument."""
+
+    def __init__(self, reward: float = 1.0) -> None:
+        super().__init__()
+        self.reward = reward
+
+    def observation_space(self, agent: str) -> Any:
+        return Dict({"clock": Box(-np.inf, np.inf, (1,), np.float64), "cells": Box(0, 255, (4, 4), np.uint8)})
+
+    def _seen(self) -> dict[str, Any]:
+        cells = np.full((4, 4), self.left, np.uint8)
+        return {agent: {"clock": np.array([1e9 + self.left]), "cells": cells} for agent in self.possible_agents}
+
+    def step(self, actions: Any) -> Any:
+        seen, rewards, *rest = super().step(actions)
+        return seen, dict.fromkeys(rewards, self.reward), *rest
+
+
+def test_numbers_of_a_game_that_learning_would_change_are_named() -> None:
+    spec = EnvironmentSpec(id="test_games:Numbers", backend="pettingzoo")
+    modules = UserModules(frozenset({"test_games"}))
+    report = check_environment(spec, modules, seconds=60.0, env_steps=20)
+    (warning,) = (each for each in report.warnings if "float32" in each)
+    assert "observation component 'clock' has the value 1,000,000,00" in warning
+    assert "in the game, subtract a reference" in warning
+    assert report.byte_maxima == {"cells": (5,)}
+    large = spec.model_copy(update={"kwargs": {"reward": 1e10}})
+    (problem,) = check_environment(large, modules, seconds=60.0, env_steps=20).problems
+    assert "the reward 1e+10, but learning takes rewards within +-1e+09: set environment.reward_scale" in problem
 
 
 def dark(render_mode: str) -> Duel:
