@@ -10,6 +10,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import CloudpickleWrapper
+from gymnasium.wrappers import TimeLimit
 
 from daedalus.actor.environments import atari
 from daedalus.actor.environments.environment_errors import (
@@ -80,6 +81,7 @@ class EnvironmentFactory:
             raise EnvironmentSetupError(
                 f"environment {spec.id} cannot render {self.render_mode} images: {reason}"
             ) from None
+        _check_limit(environment, spec)
         if "minigrid.minigrid_env" in sys.modules:
             from daedalus.actor.environments import minigrid_views  # needs an optional package
 
@@ -291,6 +293,18 @@ def _in_processes(factory: EnvironmentFactory, count: int) -> EnvironmentProcess
 def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:
     limit = {} if spec.max_episode_steps is None else {"max_episode_steps": spec.max_episode_steps}
     return {**spec.constructor_kwargs, **limit}
+
+
+def _check_limit(environment: gymnasium.Env, spec: EnvironmentSpec) -> None:
+    """Raise EnvironmentSetupError if a limit of the environment's own makes that of the specification ineffective."""
+    wanted = spec.max_episode_steps
+    while wanted is not None and isinstance(environment, gymnasium.Wrapper):
+        if isinstance(environment, TimeLimit) and environment._max_episode_steps < wanted:
+            raise EnvironmentSetupError(
+                f"environment.max_episode_steps={wanted} has no effect: what {spec.id} makes truncates its episodes "
+                f"after {environment._max_episode_steps} steps itself (TimeLimit); change it there"
+            )
+        environment = environment.env
 
 
 def _wrapped(environment: gymnasium.Env, wrap: str, modules: UserModules) -> gymnasium.Env:

@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import closing, nullcontext
 from ctypes.util import find_library
 from functools import partial
 from pathlib import Path
@@ -119,6 +119,17 @@ def test_episode_limit_counts_the_environments_own_steps() -> None:
         ([0.0, 5.0], 4.0, False, True),
         ([1.0, 0.0], 0.0, False, False),
     ]
+
+
+@pytest.mark.parametrize(("limit", "refused"), [(201, True), (200, False), (5, False)])
+def test_a_limit_beyond_that_of_the_environment_itself_is_refused(
+    limit: int, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = EnvSpec("Made-v0", lambda **kwargs: gymnasium.make("Pendulum-v1", **kwargs))
+    monkeypatch.setitem(gymnasium.registry, "Made-v0", made)
+    text = "environment.max_episode_steps=201 has no effect.*truncates its episodes after 200 steps itself"
+    with pytest.raises(EnvironmentSetupError, match=text) if refused else nullcontext():
+        make_environments(EnvironmentSpec(id="Made-v0", max_episode_steps=limit), 1).close()
 
 
 def test_no_reward_limit_ends_episodes_after_steps_without_a_positive_reward() -> None:
