@@ -7,8 +7,9 @@ whose only component is named `observation`, and an action whose only one is nam
 import contextlib
 import itertools
 import math
+import operator
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -185,7 +186,7 @@ def _components(value: Any, names: Any, what: str) -> dict[str, Any]:
 
 
 def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarray:
-    """Return one component of an observation, of any nesting that has the right number of values."""
+    """Return one component of an observation: a flat list, or lists nested as its shape, row by row."""
     if isinstance(value, bytes):  # of msgpack: the numbers themselves, little-endian
         item = np.dtype(space.dtype).newbyteorder("<")
         if len(value) != math.prod(space.shape) * item.itemsize:
@@ -212,7 +213,8 @@ def _converted(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.n
     allocate the size of the longest text for each element.
     """
     try:
-        numbers = np.asarray(array(_TYPE_CODES[space.dtype], _flat(value)))
+        shape, elements = _flat(value)
+        numbers = np.asarray(array(_TYPE_CODES[space.dtype], elements))
     except (TypeError, ValueError):
         kind = "numbers" if space.dtype == "float32" else "integers"
         raise ClientError("misfit", f"{what} is not an array of {kind}") from None
@@ -220,17 +222,31 @@ def _converted(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.n
         raise _out_of_range(space, what) from None
     if numbers.size != math.prod(space.shape):
         raise ClientError("misfit", f"{what} has {numbers.size} values, but its space is {space}")
+    if not _rows_of(shape) <= _rows_of(space.shape):  # such as an image whose width comes first
+        raise ClientError(
+            "misfit", f"{what} has the shape {tuple(shape)}, but its space is {space}: nest it so, or not"
+        )
     return numbers
 
 
-def _flat(value: Any) -> list[Any]:
-    """Return the elements of nested lists, or one element. Raises ValueError if the lists differ in length or depth."""
+def _rows_of(shape: Sequence[int]) -> set[int]:
+    """Return how many parts an array has if it is cut at each of its axes, from the first on."""
+    return set(itertools.accumulate(shape, operator.mul, initial=1))
+
+
+def _flat(value: Any) -> tuple[list[int], list[Any]]:
+    """Return the shape of nested lists and their elements, or one element.
+
+    Raises ValueError if the lists differ in length or depth.
+    """
     elements = value if isinstance(value, list) else [value]
+    shape = [len(elements)]
     while elements and isinstance(elements[0], list):
         if set(map(type, elements)) != {list} or len(set(map(len, elements))) > 1:
             raise ValueError
+        shape.append(len(elements[0]))
         elements = list(itertools.chain.from_iterable(elements))
-    return elements
+    return shape, elements
 
 
 def _out_of_range(space: ArraySpace | DiscreteSpace, what: str) -> ClientError:
@@ -244,7 +260,7 @@ def _out_of_range(space: ArraySpace | DiscreteSpace, what: str) -> ClientError:
 def _check_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str) -> None:
     types, kind = ({int}, "integers") if isinstance(space, DiscreteSpace) else ({int, float}, "numbers")
     try:
-        elements = _flat(value)
+        _, elements = _flat(value)
     except ValueError:
         elements = []
     numbers = np.array(elements if set(map(type, elements)) <= types else [])
@@ -264,6 +280,9 @@ def _mask(value: Any, space: _Component, name: str) -> np.ndarray:
     assert isinstance(space, DiscreteSpace)
     if not isinstance(value, list) or len(value) != space.choices or not set(map(type, value)) <= {bool, int}:
         raise ClientError("misfit", f"the action_mask of {name} must be a list of {space.choices} flags")
+    if other := set(value) - {0, 1}:  # such as numbers of choices
+        flags = "true or 1 for each legal choice, else false or 0"
+        raise ClientError("misfit", f"the action_mask of {name} has the value {other.pop()}: write {flags}")
     first = 0
     for count in space.counts:
         if not any(value[first : first + count]):

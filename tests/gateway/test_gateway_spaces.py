@@ -203,6 +203,7 @@ def test_wrong_spaces_are_named(observations: Any, actions: Any, text: str) -> N
         ({**OBSERVATION, "sensors.level": [1e300, 0]}, "beyond"),
         ({**OBSERVATION, "sensors.level": [float("nan"), 0]}, "not finite"),
         ({**OBSERVATION, "sensors.level": [-(2**63), 0]}, "beyond"),
+        ({**OBSERVATION, "camera.image": [[1, 2], [3, 4], [5, 6]]}, r"has the shape \(3, 2\), but its space is"),
         ({**OBSERVATION, "more": 1}, "must be a map with"),
         ([1, 2], "must be a map with"),
     ],
@@ -214,9 +215,9 @@ def test_wrong_observations_are_named(value: Any, text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "image", [[1, 2, 3, 4, 5, 255], [[[1, 2], [3, 4], [5, 255]]], [[[[1]], [[2]], [[3]], [[4]], [[5]], [[255]]]]]
+    "image", [[1, 2, 3, 4, 5, 255], [[[1, 2, 3]], [[4, 5, 255]]], [[[[1]], [[2]], [[3]], [[4]], [[5]], [[255]]]]]
 )
-def test_observation_may_have_any_nesting(image: Any) -> None:
+def test_observation_may_be_flat_or_nested_row_by_row(image: Any) -> None:
     spaces = ClientSpaces(STATED["observations"], STATED["actions"])
     observed = spaces.observation({**OBSERVATION, "camera.image": image, "mode": [[True]]})
     assert observed["camera"]["image"].tolist() == [[1, 2, 3], [4, 5, 255]]
@@ -249,6 +250,7 @@ def test_long_text_among_numbers_takes_no_memory(is_override: bool) -> None:
         ({"gear": [0, 0, 0, 0]}, "forbids every choice"),
         ({"lights": [1, 1, 1, 1]}, "must be a map with gear"),
         ({"gear": [2.5, 0, 0, 0]}, "a list of 4 flags"),
+        ({"gear": [3, 1, 0, 2]}, "has the value [23]: write true or 1 for each legal choice"),
     ],
 )
 def test_wrong_masks_are_named(mask: Any, text: str) -> None:
