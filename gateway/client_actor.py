@@ -1,5 +1,6 @@
 """One client as an actor towards the learner: its rows and its rollouts. For the gateway's event loop."""
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,8 +12,10 @@ from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_cl
 from daedalus.actor.collecting.client_seats import MatchSeat, seated_space
 from daedalus.actor.collecting.loop_recorder import EpisodeTape
 from daedalus.actor.collecting.rollout_writer import RowInputs
+from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import mask_of_one
+from daedalus.actor.environments.precision import FirstLosses
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.errors import ActorError
 from daedalus.gateway.client_messages import Act, ClientError, EndEpisode
@@ -25,6 +28,8 @@ from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.spec import ActorSpec
 
+_logger = logging.getLogger(__name__)
+
 
 class ClientActor:
     """The state of one client, across its connections and the learner's epochs."""
@@ -35,6 +40,8 @@ class ClientActor:
         self._seat: MatchSeat | None = None
         self.heard_at = time.monotonic()
         self.version: PolicyVersion | None = None  # of the rollout that is being written
+        self._losses: FirstLosses | None = None
+        self._told = set[str]()  # components whose losses were reported
         self._on_action: Callable[[Any], None] = _ignore  # receives the action that the client waits for
         self._session: Welcome | None = None  # that it has joined
         self._transforms: Transforms | None = None  # of that session
@@ -80,6 +87,7 @@ class ClientActor:
         except (ActorError, EnvironmentSetupError) as error:
             raise ClientError("refused", str(error)) from None
         check_images(self.spaces.stated, spec.environment)
+        self._losses = FirstLosses(without(self.spaces.observation_space, spec.environment.leave_out), self._told)
         return replace(self.join, spaces=transforms.spaces, environments=1), transforms
 
     def joined(self, session: Welcome, transforms: Transforms) -> None:
@@ -118,6 +126,8 @@ class ClientActor:
             raise ClientError("misfit", str(error)) from None
         if begins:
             self._begin(rows, current)
+        for text in self._losses.add(values) if self._losses is not None else ():
+            _logger.warning("client %s: %s", self.name, text)
         self._on_action, self._override, self._played = on_action, message.override, played
         if self.tape is not None:
             self.tape.reward(message.reward)

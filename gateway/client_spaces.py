@@ -81,7 +81,7 @@ class ClientSpaces:
         return size + sum(_NAME_BYTES + _NUMBER_BYTES * space.size for space in self._actions.values())
 
     def observation(self, value: Any) -> Any:
-        """Return an observation as gymnasium has it. Raises ClientError if it does not fit."""
+        """Return an observation as gymnasium has it; numbers in JSON are float64 yet. Raises ClientError."""
         if self._observations.keys() == {"observation"}:
             return _array(value, self._observations["observation"], "the observation")
         parts = _components(value, self._observations.keys(), "the observation")
@@ -200,10 +200,9 @@ def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarr
         return values.astype(np.int64) if space.size > 1 else np.int64(values[0])  # type: ignore[return-value] - gymnasium's Discrete has numbers, not arrays
     if space.dtype == "uint8":
         return values.astype(np.uint8).reshape(space.shape)
-    numbers = np.asarray(values, np.float64)
-    if unfit := unfit_number(numbers):
+    if unfit := unfit_number(np.asarray(values, np.float64)):
         raise ClientError("misfit", f"{what} {unfit}")
-    return numbers.astype(np.float32).reshape(space.shape)
+    return values.reshape(space.shape)
 
 
 def _converted(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarray:

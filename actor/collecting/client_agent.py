@@ -11,12 +11,10 @@ from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.client_seats import MatchSeat
 from daedalus.actor.collecting.loop_recorder import EpisodeTape
 from daedalus.actor.collecting.policy_guard import PolicyGuard
-from daedalus.actor.environments.precision import Precision
+from daedalus.actor.environments.precision import FirstLosses
 from daedalus.protocol.lessons import Parameters
 
 _logger = logging.getLogger(__name__)
-
-_MOST_WATCHED = 1000  # observations
 
 
 class ClientAgent:
@@ -46,22 +44,12 @@ class ClientAgent:
         self._rows: ClientRows | None = None
         self._loaded: LoadedPolicy | None = None  # that acts
         self.actions = self.overridden_actions = self.safe_actions = 0
-        self._precision: Precision | None = None  # of the first observations
-        self._watched, self._warned = 0, set[str]()
+        self._losses: FirstLosses | None = None
+        self._told = set[str]()  # components whose losses were reported
 
     def watch(self, space: gymnasium.Space) -> None:
         """Warn of what float32 loses of the next observations, of which a space has the components that are read."""
-        self._precision, self._watched = Precision(space), 0
-
-    def _warn_of_losses(self, observation: Any) -> None:
-        if self._precision is None or self._watched >= _MOST_WATCHED:
-            return
-        self._watched += 1
-        self._precision.add(observation)
-        for name, text in self._precision.warnings.items():
-            if name not in self._warned:
-                self._warned.add(name)
-                _logger.warning("%s", text)
+        self._losses = FirstLosses(space, self._told)
 
     def act(self, observation: Any, action_mask: Any = None, *, override: Any = None) -> Any:
         """Return the action to take now. After the end of the run it is the last policy's, and nobody learns from it.
@@ -82,7 +70,8 @@ class ClientAgent:
         assert rows is not None  # a Client waits for the first policy
         rows.observe(observation, action_mask)
         self.actions += 1
-        self._warn_of_losses(observation)
+        for text in self._losses.add(observation) if self._losses is not None else ():
+            _logger.warning("%s", text)
         while True:
             if rows.is_between_rollouts:
                 self._load_newest(rows)

@@ -60,6 +60,27 @@ class Precision:
         }
 
 
+_MOST_WATCHED = 1000  # observations
+
+
+class FirstLosses:
+    """What float32 loses of the first observations of a client's loop."""
+
+    def __init__(self, space: gymnasium.Space, told: set[str]) -> None:
+        """Construct from the observation space, of the components that are read, and those that were warned of."""
+        self._precision, self._watched, self._told = Precision(space), 0, told
+
+    def add(self, observation: Any) -> list[str]:
+        """Take note of an observation, and return the warnings that are new, one for each component at fault."""
+        if self._watched >= _MOST_WATCHED:
+            return []
+        self._watched += 1
+        self._precision.add(observation)
+        new = {name: text for name, text in self._precision.warnings.items() if name not in self._told}
+        self._told.update(new)
+        return [*new.values()]
+
+
 class _Seen:
     """The numbers of one component."""
 

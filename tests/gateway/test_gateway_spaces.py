@@ -375,3 +375,14 @@ def test_each_client_explores_with_its_own_epsilon(network: MemoryNetwork) -> No
     is_greedy = np.isclose(rollouts["curious"].behaviour_log_probs, math.log(0.75), atol=1e-5)
     assert (is_random | is_greedy).all()
     assert 0 < is_random.mean() < 0.6
+
+
+def test_numbers_of_a_client_that_float32_rounds_are_a_warning(
+    play: Callable[..., tuple[list[Any], Rollout]], caplog: pytest.LogCaptureFixture
+) -> None:
+    spec = run_spec()
+    transforms = spaces_of(spec, *SAME, MASK)
+    observation = {**OBSERVATION, "sensors.level": [0.5, 1764449001]}
+    play(spec, transforms, STATED, observation=observation, action_mask=MASK)
+    (warning,) = (record.getMessage() for record in caplog.records if "float32" in record.getMessage())
+    assert warning.startswith("client c: observation component 'sensors.level' has the value 1,764,449,001, which beco")
