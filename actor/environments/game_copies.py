@@ -7,10 +7,13 @@ import gymnasium
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import MASK_KEY
+from daedalus.actor.environments.roles import listed
 from daedalus.protocol.spec import EnvironmentSpec
 
 _MOST_EMPTY_MATCHES = 100  # in a row, in which no agent with a seat has a part
 _MOST_IDLE_TURNS = 100_000  # of agents without a seat, between two turns of the seats
+
+_OF_ALL = "__all__"  # an entry that environments for RLlib have beside those of the agents
 
 OtherAction = Callable[[str, Any, Any], Any]  # of an agent without a seat, for its observation and info
 
@@ -52,7 +55,7 @@ def game_copy(environment: Any, seats: Sequence[str], others: OtherAction) -> Ga
     """Return a copy of a game as one of these, for a PettingZoo environment."""
     if hasattr(environment, "agent_iter"):
         return _TurnGame(environment, seats, others)
-    return _SimultaneousGame(_in_rounds(environment), seats, others)
+    return _SimultaneousGame(environment, seats, others)
 
 
 def without_checks(environment: Any, spec: EnvironmentSpec) -> Any:
@@ -150,7 +153,8 @@ class _SimultaneousGame:
     """A game whose agents act together (PettingZoo's parallel interface)."""
 
     def __init__(self, environment: Any, agents: Sequence[str], others: OtherAction) -> None:
-        self._environment, self._agents, self._others = environment, frozenset(agents), others
+        self._environment, self._agents, self._others = _in_rounds(environment), frozenset(agents), others
+        self._possible = dict.fromkeys(environment.possible_agents)
         self._seen: dict[str, tuple[Any, Any]] = {}  # newest observation and info of the agents that are not ours
 
     def reset(self, seed: int | None) -> list[Outcome]:
@@ -183,8 +187,20 @@ class _SimultaneousGame:
             for agent in before
         }
         observations, rewards, terminated, truncated, infos = self._environment.step(chosen)
+        self._refuse_others({"rewards": rewards, "terminations": terminated, "truncations": truncated})
         came = [agent for agent in self._environment.agents if agent not in before]
         return self._outcomes((*before, *came), observations, rewards, terminated, truncated, infos)
+
+    def _refuse_others(self, results: Mapping[str, Mapping[str, Any]]) -> None:
+        """Raise EnvironmentSetupError for a result of nobody: what an agent has no entry in is 0 or False for it."""
+        for name, values in results.items():
+            if not values.keys() <= self._possible.keys() and (
+                others := values.keys() - self._possible.keys() - {_OF_ALL}
+            ):
+                raise EnvironmentSetupError(
+                    f"its {name} have an entry for {min(others, key=str)!r}, which is no agent: its possible_agents are "
+                    f"{listed([*self._possible])}"
+                )
 
     @property
     def is_over(self) -> bool:

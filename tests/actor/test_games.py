@@ -415,6 +415,8 @@ class Duel(ParallelEnv):
         here, over = self.agents, self.left <= 0 and (self.problem != "endless" or actions["red"] == 1)
         rewards = {agent: float(actions[agent]) if self.problem != "reward" else np.nan for agent in here}
         self.agents = [] if over else here
+        if self.problem == "other agent":
+            rewards = {"Red": 1.0, "__all__": 1.0}
         return self._seen(), rewards, dict.fromkeys(here, over), dict.fromkeys(here, False), self._info()
 
     def _seen(self) -> dict[str, np.ndarray]:
@@ -566,6 +568,11 @@ def test_a_game_is_checked() -> None:
         ("", {"agents": ("green",)}, "names 'green', but the agents of test_games:Duel are red, blue"),
         ("shape", {}, "(red|blue) observes .* which is not of its space"),
         ("no last observation", {}, "no observation of red after its action"),
+        (
+            "other agent",
+            {},
+            "its rewards have an entry for 'Red', which is no agent: its possible_agents are red, blue",
+        ),
         ("no choice", {}, "forbids every choice"),
         ("reward", {}, "red has the reward nan: it must be finite"),
         ("raises", {}, "step raises RuntimeError: the table broke"),
