@@ -66,6 +66,26 @@ class Drawn(Odd):
         return observation, self._reward, *rest
 
 
+class Starting(Odd):
+    """Odd, whose first observation has a number that is drawn; `seeds` is the generator of a reset without a seed."""
+
+    def __init__(self, seeds: str) -> None:
+        super().__init__()
+        self._seeds, self._start = seeds, 0.0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        if self._seeds == "its own":
+            self._start = self.np_random.uniform(-1.0, 1.0)
+        else:
+            always = self._seeds == "always 42"
+            self._start = np.random.default_rng(42 if always or seed is None else seed).uniform(-1.0, 1.0)
+        return self._observe(), {}
+
+    def _observe(self) -> Any:
+        return np.array([self._start, self._step / 3], np.float32)
+
+
 class Popping(Odd):
     """Odd, whose constructor takes its options out of a map."""
 

@@ -6,7 +6,7 @@ import importlib
 import re
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing, suppress
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from daedalus.actor.environments.bots import RandomActions
-from daedalus.actor.environments.components import is_text, leaves
+from daedalus.actor.environments.components import is_text, leaves, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
 from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.gymnasium_backend import make_single, registration
@@ -169,6 +169,63 @@ def own_task(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str
                 f"{'a generator with its seed' if spec.is_game else 'self.np_random'}"
             )
     return ""
+
+
+_SEEDS, _UNSEEDED = 3, 10  # resets; a chance of two starts repeats one so often once in a thousand environments
+
+
+def fixed_start(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str:
+    """Return a warning if resets without a seed all begin alike, though the seed changes how an episode begins.
+
+    Only the first episode of an environment has a seed in training, as usual; in evaluations each has one. Returns an
+    empty string also if that cannot be known within `seconds`. For the arguments see `own_task`.
+    """
+    until, starts = time.monotonic() + seconds, list[list[np.ndarray]]()
+    spec = spec.model_copy(update={"agent_ids": False})
+    with suppress(Exception, SystemExit):  # of the user's code; playing reports it
+        environment = make_games(spec, 1, modules) if spec.is_game else make_single(spec, modules)
+        if environment is None:
+            return ""
+        with closing(environment):
+            begin = _beginning(environment, spec)
+            for seed in (*range(_SEEDS), *[None] * _UNSEEDED):
+                if time.monotonic() > until:
+                    return ""
+                starts.append(begin(seed))
+        seeded, unseeded = starts[:_SEEDS], starts[_SEEDS:]
+        if all(_equal(each, seeded[0]) for each in seeded) or not all(_equal(each, unseeded[0]) for each in unseeded):
+            return ""
+        return (
+            f"environment {spec.id}: all episodes that reset begins without a seed begin alike, but those with seeds "
+            "differ: training gives a seed to the first episode of each environment only, and so plays one start, "
+            "while evaluations play others; seed the generator of random numbers only where reset gets a seed"
+        )
+    return ""
+
+
+def _beginning(
+    environment: gymnasium.Env | GameEnvironments, spec: EnvironmentSpec
+) -> Callable[[int | None], list[np.ndarray]]:
+    """Return a function that resets an environment with a seed or None, and returns the first observation."""
+    space = without(environment.observation_space, spec.leave_out)
+    read = [leaf for leaf in leaves(space, "observation") if leaf.space.shape is not None]
+
+    def shown(observations: Iterable[Any]) -> list[np.ndarray]:
+        return [leaf.of(each).copy() for each in observations for leaf in read]
+
+    if isinstance(environment, GameEnvironments):
+        (copy,) = environment.copies_for(environment.agents)
+        return lambda seed: shown(outcome.observation for outcome in copy.reset(seed))
+    return lambda seed: shown([environment.reset(seed=seed)[0]])
+
+
+def _equal(start: list[np.ndarray], other: list[np.ndarray]) -> bool:
+    return len(start) == len(other) and all(map(np.array_equal, start, other))
+
+
+def seed_warnings(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> tuple[str, ...]:
+    """Return what is wrong with how an environment uses its seed; each part takes about `seconds` at most."""
+    return tuple(filter(None, (own_task(spec, modules, seconds), fixed_start(spec, modules, seconds))))
 
 
 def _first_rows_of_seats(games: GameEnvironments, spec: EnvironmentSpec) -> list[np.ndarray]:

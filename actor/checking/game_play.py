@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
 from daedalus.actor.checking.check_report import EnvironmentReport
-from daedalus.actor.checking.checker import STEPS_FOR_MASKS, mask_warning, own_task
+from daedalus.actor.checking.checker import STEPS_FOR_MASKS, mask_warning, seed_warnings
 from daedalus.actor.checking.violations import byte_maxima, learned_reward_violations, observation_violations
 from daedalus.actor.environments.bots import RandomActions, make_bot
 from daedalus.actor.environments.components import without
@@ -60,8 +60,9 @@ def check_game(
         for bot in bots:
             _play_bot(environments, games, bot, modules, seed)
         is_slow = time.monotonic() - began > 2.0 * seconds + 1.0  # to make others could take as long
-        if not is_slow and (warning := own_task(spec, modules, seconds / 3)):
-            report = report.model_copy(update={"warnings": (*report.warnings, warning)})
+        if not is_slow:
+            more = seed_warnings(spec, modules, seconds / 3)
+            report = report.model_copy(update={"warnings": (*report.warnings, *more)})
         return report
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))

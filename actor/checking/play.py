@@ -19,7 +19,7 @@ from daedalus.actor.checking.checker import (
     Texts,
     mask_warning,
     minigrid_codes,
-    own_task,
+    seed_warnings,
     square_maps,
 )
 from daedalus.actor.checking.game_play import check_game
@@ -230,8 +230,9 @@ def check_environment(
     problem = vectorized_problem(left_out, modules, report.spaces, seed) or _evaluated_problem(spec, modules, report)
     if problem:
         return report.model_copy(update={"problems": (problem,)})
-    if spec.backend == "gymnasium" and not is_slow and (warning := own_task(left_out, modules, seconds / 3)):
-        report = report.model_copy(update={"warnings": (*report.warnings, warning)})
+    if spec.backend == "gymnasium" and not is_slow:
+        more = seed_warnings(left_out, modules, seconds / 3)
+        report = report.model_copy(update={"warnings": (*report.warnings, *more)})
     return report.model_copy(update={"vectorized": uses_vector_entry_point(spec, modules)})
 
 

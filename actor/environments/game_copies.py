@@ -198,8 +198,8 @@ class _SimultaneousGame:
                 others := values.keys() - self._possible.keys() - {_OF_ALL}
             ):
                 raise EnvironmentSetupError(
-                    f"its {name} have an entry for {min(others, key=str)!r}, which is no agent: its possible_agents are "
-                    f"{listed([*self._possible])}"
+                    f"its {name} have an entry for {min(others, key=str)!r}, which is no agent: its possible_agents "
+                    f"are {listed([*self._possible])}"
                 )
 
     @property

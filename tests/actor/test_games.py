@@ -500,6 +500,29 @@ def test_a_mask_that_no_agent_reads_is_a_warning(legal_in: str) -> None:
     assert ["'legal_moves' of info seems to say" in each for each in report.warnings] == [True] * bool(legal_in)
 
 
+class Dealt(Board):
+    """Each match deals a card; without a seed it may be always the same."""
+
+    def __init__(self, fixed: bool) -> None:
+        super().__init__(own=True)
+        self.fixed = fixed
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.card = np.random.default_rng(42 if seed is None and self.fixed else seed).random()
+        return super().reset(seed, options)
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        return {agent: seen * self.card for agent, seen in super()._seen().items()}
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_matches_that_all_begin_alike_without_a_seed_are_a_warning(fixed: bool) -> None:
+    spec = EnvironmentSpec(id="test_games:Dealt", backend="pettingzoo", kwargs={"fixed": fixed})
+    report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20)
+    assert report.problems == ()
+    assert ["training gives a seed to the first episode" in each for each in report.warnings] == [True] * fixed
+
+
 class Numbers(Board):
     """It observes numbers that float32 rounds, and bytes that may be codes; the reward is an argument."""
 

@@ -118,6 +118,14 @@ def test_task_that_the_constructor_draws_is_a_warning(drawn_by: str, warns: bool
     assert ["draw it in reset, from self.np_random" in warning for warning in report.warnings] == [True] * warns
 
 
+@pytest.mark.parametrize(("seeds", "warns"), [("42 without one", True), ("its own", False), ("always 42", False)])
+def test_episodes_that_all_begin_alike_without_a_seed_are_a_warning(seeds: str, warns: bool) -> None:
+    """Training would play one start, and evaluations, whose episodes all have a seed, others."""
+    report = check_environment(spec("Starting", seeds=seeds), MODULES, seconds=60.0, env_steps=10)
+    assert report.problems == ()
+    assert ["training gives a seed to the first episode" in warning for warning in report.warnings] == [True] * warns
+
+
 def test_environments_do_not_share_what_their_constructor_changes_in_place() -> None:
     given = {"options": {"masks": "lists"}}
     checked = spec("Popping", **given)
