@@ -11,10 +11,12 @@ from pydantic import ValidationError
 from daedalus.actor.environments.components import (
     ActionComponents,
     BoundedActions,
+    LeftOut,
     ObservationComponent,
     batch_of_one,
     continuous_space,
     exported_dtype,
+    leaves,
     observation_components,
     only_of_batch,
     without,
@@ -310,8 +312,11 @@ class LegalRepeats:
         self._action_space, self._actions = action_space, _actions(spec, action_space)
         seen = without(observation_space, spec.leave_out)
         parts = seen.spaces if isinstance(seen, gymnasium.spaces.Dict) else {}
-        self._mask_space = gymnasium.spaces.Dict({name: part for name, part in parts.items() if name == MASK_KEY})
-        self._observed_masks = ObservedMasks(observation_components(seen), self._actions.spaces)
+        # Nothing else is read here: whoever makes the environment may leave out a text of it later.
+        self._mask_space = gymnasium.spaces.Dict({MASK_KEY: parts.get(MASK_KEY, LeftOut())})
+        is_read = any(not isinstance(leaf.space, LeftOut) for leaf in leaves(self._mask_space, MASK_KEY))
+        components = observation_components(self._mask_space) if is_read else ()
+        self._observed_masks = ObservedMasks(components, self._actions.spaces)
         self._masks: Masks | None = None  # known with the first one
 
     def __call__(self, action: Any, observation: Any, info: Mapping[str, Any]) -> bool:
