@@ -49,6 +49,15 @@ class PathWithMethod(Path):
         return super().reset(seed=seed)
 
 
+class Wearing(PathWithMethod):
+    """A path that loses its stones when an episode ends."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, *rest = super().step(action)
+        self.stones = 1 if terminated else self.stones
+        return observation, reward, terminated, *rest
+
+
 class Odd(gymnasium.Env[Any, Any]):
     """Reads its options in one of many ways."""
 

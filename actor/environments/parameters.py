@@ -102,9 +102,9 @@ class WithParameters(gymnasium.Wrapper):
         given, method = self.next_parameters, self._method
         shown = ", ".join(f"{name}={exact_number(value)}" for name, value in given.items())
         if method is not None:
-            if given != self._set:
-                self._call(f"{_METHOD}({shown})", given, lambda: method(**given))
-                self._set = given
+            # Also with values that have not changed: an episode may have changed them.
+            self._call(f"{_METHOD}({shown})", given, lambda: method(**given))
+            self._set = given
             return self.env.reset(seed=seed, options=options)
         all_options: dict[str, Any] = {**(options or {}), **given}
         if given == self._set:
@@ -125,7 +125,7 @@ class WithParameters(gymnasium.Wrapper):
         except EnvironmentSetupError:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
-            changed = next(name for name, value in given.items() if self._set.get(name) != value)
+            changed = next((name for name, value in given.items() if self._set.get(name) != value), next(iter(given)))
             print_traceback(error)
             section = "environment.parameters" if given[changed] == self._true.get(changed) else "lessons"
             remedy = f"if it refuses a value, change {section}.{changed}"

@@ -1,6 +1,7 @@
 """Parameters that the learner sets: how actors apply, draw and acknowledge them."""
 
 import itertools
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -68,6 +69,16 @@ def test_evaluations_play_the_true_task_and_a_run_without_lessons_acknowledges_n
     rollout = collect(collector)
     assert rollout.lessons == {}
     assert set(rollout.episode_lengths.tolist()) == {7}
+
+
+@pytest.mark.parametrize("one_episode", [False, True])
+def test_each_episode_begins_with_its_parameters_also_if_the_last_one_has_changed_them(one_episode: bool) -> None:
+    wearing = path("Wearing")
+    with closing(make_environments(wearing, 1, modules=TEST_MODULES, one_episode=one_episode)) as environments:
+        for _ in range(2):
+            environments.reset(3)
+            ends = [environments.step({"action": np.zeros((1, 1), np.uint8)})[2].any() for _ in range(15)]
+            assert ends == ([False] * 6 + [True] + [False] * 7 + [not one_episode])
 
 
 METHOD = "lesson_environment:PathWithMethod"
