@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,10 @@ from gymnasium.vector.utils import batch_space, iterate
 from daedalus.actor.checking.check_report import EnvironmentReport
 from daedalus.actor.checking.checker import STEPS_FOR_MASKS, mask_warning, seed_warnings
 from daedalus.actor.checking.violations import byte_maxima, learned_reward_violations, observation_violations
-from daedalus.actor.environments.bots import RandomActions, make_bot
+from daedalus.actor.environments.bots import LegalActions, RandomActions, make_bot
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.games import GameEnvironments, make_games
+from daedalus.actor.environments.games import GameEnvironments, make_copies, make_games, mask_of
 from daedalus.actor.environments.gymnasium_environments import limited_close
 from daedalus.actor.environments.info import unreported
 from daedalus.actor.environments.precision import Precision
@@ -61,8 +61,8 @@ def check_game(
             _play_bot(environments, games, bot, modules, seed)
         is_slow = time.monotonic() - began > 2.0 * seconds + 1.0  # to make others could take as long
         if not is_slow:
-            more = seed_warnings(spec, modules, seconds / 3)
-            report = report.model_copy(update={"warnings": (*report.warnings, *more)})
+            more = [*seed_warnings(spec, modules, seconds / 3), _rewards_warning(spec, modules, seconds / 3)]
+            report = report.model_copy(update={"warnings": (*report.warnings, *filter(None, more))})
         return report
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
@@ -152,6 +152,45 @@ def _played(
         "returns": tuple(returns),
         "byte_maxima": {name: tuple(map(int, each)) for name, each in maxima.items()},
     }
+
+
+_ROUNDING = 1e-3  # relative, of sums of rewards
+
+
+def _rewards_warning(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str:
+    """Return a warning if the rewards of a game in turns are not those that its agents get, or an empty string.
+
+    An AECEnv adds `rewards` to `_cumulative_rewards` after each step, which `last` returns, and sets those of the agent
+    that acts to 0 before: its author calls two methods for it. One match is played, or nothing is known.
+    """
+    (game,) = make_copies(spec, 1, modules)
+    with suppress(Exception, SystemExit), closing(game):  # of the user's code; playing reports it
+        if not hasattr(game, "agent_iter"):
+            return ""
+        random, until = np.random.default_rng(0), time.monotonic() + seconds
+        actions = {agent: LegalActions(game.action_space(agent)) for agent in game.possible_agents}
+        earned, received = (dict.fromkeys(game.possible_agents, 0.0) for _ in range(2))
+        game.reset(seed=0)
+        while game.agents:
+            if time.monotonic() > until:
+                return ""
+            agent = game.agent_selection
+            observation, reward, terminated, truncated, info = game.last()
+            received[agent] += float(reward)
+            if terminated or truncated:
+                game.step(None)
+                continue
+            game.step(actions[agent].sample(mask_of(observation, info), random))
+            for each, reward in game.rewards.items():
+                earned[each] += float(reward)
+        for agent, expected in earned.items():
+            if not np.isclose(received[agent], expected, rtol=_ROUNDING, atol=1e-6):
+                return (
+                    f"environment {spec.id}: the `rewards` of {agent} in a match add up to {expected:g}, but it gets "
+                    f"{received[agent]:g} by `last`, which is learned from: `step` must set _cumulative_rewards of the "
+                    "agent that acts to 0 first, and call _accumulate_rewards() at its end"
+                )
+    return ""
 
 
 def _mask_warning(environments: TransformedEnvironment, games: GameEnvironments, observed: Observed) -> str:

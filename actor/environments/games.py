@@ -199,7 +199,7 @@ class GameEnvironments:
             self._write(seat, outcome)
             self.acting[seat], self.infos[seat] = True, outcome.info
             if self._in_match[seat] is not None:
-                self._newest[seat] = outcome.observation, _mask(outcome.observation, outcome.info)
+                self._newest[seat] = outcome.observation, mask_of(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:
                 self._warn_of_reward(outcome)
             self._ended[seat] = outcome.terminated or outcome.truncated
@@ -269,7 +269,7 @@ class GameEnvironments:
         """Return a legal action of an agent without a seat."""
         if agent not in self._others:
             self._others[agent] = LegalActions(self._environments[0].action_space(agent))
-        return self._others[agent].sample(_mask(observation, info), self._random[number])
+        return self._others[agent].sample(mask_of(observation, info), self._random[number])
 
     def render(self) -> str | np.ndarray | None:
         """Return the first copy as a text or an image [H, W, 3] uint8; None if the games were not made to be shown."""
@@ -321,7 +321,7 @@ def close_copies(name: str, environments: Sequence[Any]) -> None:
         raise EnvironmentSetupError(f"environment {name}: close raises {first_line(errors[0])}") from errors[0]
 
 
-def _mask(observation: Any, info: Any) -> Any:
+def mask_of(observation: Any, info: Any) -> Any:
     """Return the mask of legal actions that a game gives with an observation, or None."""
     mask = observation.get(MASK_KEY) if isinstance(observation, Mapping) else None
     return info.get(MASK_KEY) if mask is None and isinstance(info, Mapping) else mask

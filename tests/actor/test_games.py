@@ -11,7 +11,7 @@ from collectors import collect, started_collector
 from gymnasium.spaces import Box, Dict, Discrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.classic.tictactoe import tictactoe
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
@@ -521,6 +521,52 @@ def test_matches_that_all_begin_alike_without_a_seed_are_a_warning(fixed: bool) 
     report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20)
     assert report.problems == ()
     assert ["training gives a seed to the first episode" in each for each in report.warnings] == [True] * fixed
+
+
+class Alternate(AECEnv):
+    """Two agents in turns, with the faults that rewards of an AECEnv can have."""
+
+    metadata = {"name": "alternate"}  # noqa: RUF012  # as PettingZoo has it
+
+    def __init__(self, fault: str) -> None:
+        super().__init__()
+        self.possible_agents, self.fault = ["red", "blue"], fault
+
+    def observation_space(self, agent: str) -> Box:
+        return Box(0.0, 9.0, (2,), np.float32)
+
+    def action_space(self, agent: str) -> Discrete:
+        return Discrete(3)
+
+    def observe(self, agent: str) -> np.ndarray:
+        return np.array([self.turn, agent == "red"], np.float32)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> None:
+        self.turn, self.agents = 0, list(self.possible_agents)
+        self.rewards, self._cumulative_rewards = dict.fromkeys(self.agents, 0.0), dict.fromkeys(self.agents, 0.0)
+        self.terminations, self.truncations = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, False)
+        self.infos, self.agent_selection = {agent: {} for agent in self.agents}, "red"
+
+    def step(self, action: Any) -> None:
+        agent, other = self.agent_selection, {"red": "blue", "blue": "red"}[self.agent_selection]
+        if self.terminations[agent]:
+            self._was_dead_step(action)
+            return
+        if self.fault != "not set to 0":
+            self._cumulative_rewards[agent] = 0
+        self.turn, self.rewards, self.agent_selection = self.turn + 1, {agent: 1.0, other: -3.0}, other
+        self.terminations = dict.fromkeys(self.agents, self.turn >= 6)
+        if self.fault != "not accumulated":
+            self._accumulate_rewards()
+
+
+@pytest.mark.parametrize(("fault", "received"), [("", ""), ("not set to 0", "-12"), ("not accumulated", "0")])
+def test_rewards_of_a_game_in_turns_that_its_agents_do_not_get_are_a_warning(fault: str, received: str) -> None:
+    spec = EnvironmentSpec(id="test_games:Alternate", backend="pettingzoo", kwargs={"fault": fault})
+    report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20)
+    assert report.problems == ()
+    text = f"`rewards` of red in a match add up to -6, but it gets {received} by `last`"
+    assert [text in each for each in report.warnings] == [True] * bool(fault)
 
 
 class Numbers(Board):
