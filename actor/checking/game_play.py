@@ -163,8 +163,8 @@ def _rewards_warning(spec: EnvironmentSpec, modules: UserModules, seconds: float
     An AECEnv adds `rewards` to `_cumulative_rewards` after each step, which `last` returns, and sets those of the agent
     that acts to 0 before: its author calls two methods for it. One match is played, or nothing is known.
     """
-    (game,) = make_copies(spec, 1, modules)
-    with suppress(Exception, SystemExit), closing(game):  # of the user's code; playing reports it
+    # Of the user's code; playing reports it. A second copy may not be possible beside the first.
+    with suppress(Exception, SystemExit), closing(make_copies(spec, 1, modules)[0]) as game:
         if not hasattr(game, "agent_iter"):
             return ""
         random, until = np.random.default_rng(0), time.monotonic() + seconds
