@@ -31,6 +31,7 @@ from daedalus.actor.checking.violations import (
     reset_violations,
     step_violations,
 )
+from daedalus.actor.environments import atari
 from daedalus.actor.environments.bots import RandomActions
 from daedalus.actor.environments.components import batch_of_one, only_of_batch, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
@@ -319,7 +320,8 @@ class _Play:
         self._still, self._newest = StillObservations(), dict[str, np.ndarray]()  # the newest observation
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
-        self._warnings = {text: text for text in unsaved_statistics(environment)}  # the first of each kind
+        found = (*unsaved_statistics(environment), atari.repeated_twice(environment, spec.action_repeat))
+        self._warnings = {text: text for text in found if text}  # the first of each kind
         self._byte_maxima = byte_maxima(transforms.spaces)
         self._env_steps, self._resets = 0, 0
         self._step_seconds, self._busy_seconds, self._reset_seconds = 0.0, 0.0, 0.0

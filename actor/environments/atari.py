@@ -164,3 +164,17 @@ def wrapped(environment: gymnasium.Env, arguments: dict[str, Any]) -> gymnasium.
 def pools_frames(spec: EnvironmentSpec) -> bool:
     """Return whether an observation is the maximum of two frames, in a specification for gymnasium."""
     return spec.kwargs.get("maxpool") is True
+
+
+def repeated_twice(environment: gymnasium.Env, action_repeat: int) -> str:
+    """Return a warning if the run repeats the actions of a game that repeats them itself, or an empty string."""
+    registered = environment.spec
+    if action_repeat == 1 or registered is None or not str(registered.entry_point).startswith("ale_py"):
+        return ""
+    frames = registered.kwargs.get("frameskip", 4)
+    if frames == 1:
+        return ""
+    return (
+        f"the run takes each action {action_repeat} times (environment.action_repeat), and the game shows it for "
+        f"{frames} frames each time itself: leave action_repeat out, or use --set environment.kwargs.frameskip=1"
+    )

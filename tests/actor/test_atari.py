@@ -9,6 +9,7 @@ import pytest
 from plain import PlainEnvironments, choices
 from saved_runs import save
 
+from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.atari import PooledFrames, RandomStart
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
@@ -116,6 +117,16 @@ def test_frames_before_an_episode_do_not_count_against_its_limit() -> None:
         ends = [bool(environments.step(np.zeros(1, np.int64))[3][0]) for _ in range(10)]
         assert ends == [False] * 9 + [True]
     environments.close()
+
+
+@pytest.mark.parametrize(
+    ("fields", "warns"),
+    [({"action_repeat": 4}, True), ({"action_repeat": 4, "kwargs": {"frameskip": 1}}, False)],
+)
+def test_actions_that_run_and_game_both_repeat_are_a_warning(fields: dict[str, Any], warns: bool) -> None:
+    spec = EnvironmentSpec(id="ALE/Pong-v5", **fields)
+    warnings = check_environment(spec, NO_MODULES, seconds=0.0, env_steps=0).warnings
+    assert ["shows it for 4 frames each time itself" in each for each in warnings] == [True] * warns
 
 
 def test_a_policy_in_a_loop_of_the_caller_sees_pooled_frames(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
