@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing, suppress
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -15,7 +16,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from daedalus.actor.environments.bots import RandomActions
-from daedalus.actor.environments.components import is_text, leaves, without
+from daedalus.actor.environments.components import is_text, leaves, numbered, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
 from daedalus.actor.environments.games import GameEnvironments, make_games
 from daedalus.actor.environments.gymnasium_backend import make_single, registration
@@ -136,71 +137,66 @@ def _shown(text: str) -> str:
 _FIRST_STEPS = 20  # of an episode, which two environments with one seed play
 
 
-def own_task(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str:
-    """Return a warning if the seed of an environment does not decide what it plays, but its constructor does.
-
-    Two environments with one seed then play differently, though each repeats its own episode. gymnasium's checker sees
-    only the latter. Returns an empty string also if that cannot be known within about twice `seconds`.
+def seed_warnings(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> tuple[str, ...]:
+    """Return what is wrong with how an environment uses its seed, as far as it is known within about 3 x `seconds`.
 
     Args:
       spec: the environment or game, and its transforms, without texts in its observations.
       modules: the modules that may be imported for it.
-      seconds: for the first environment.
+      seconds: for each part.
     """
-    until, played = time.monotonic() + seconds, list[list[np.ndarray]]()
+    found = list[str]()
     with suppress(Exception, SystemExit):  # of the user's code; playing reports it
-        for episodes in (2, 1):
-            environment = make_games(spec, 1, modules) if spec.is_game else make_single(spec, modules)
-            if environment is None:
-                return ""
-            with closing(environment):
-                for _ in range(episodes):
-                    if time.monotonic() > until:
-                        return ""
-                    played.append(_first_rows(environment, spec))
-            if not _alike(played[0], played[1]):
-                return ""  # gymnasium's checker says so
-            until = np.inf
-        if not _alike(played[0], played[2]):
-            return (
-                f"environment {spec.id}: two of them with the same seed play differently, though each repeats its own "
-                "episode: its constructor draws what the seed does not decide, so that every environment of training "
-                "and of evaluations has a task of its own; draw it in reset, from "
-                f"{'a generator with its seed' if spec.is_game else 'self.np_random'}"
-            )
-    return ""
+        make = partial(make_games, spec, 1) if spec.is_game else partial(make_single, spec)
+        environment, until = make(modules), time.monotonic() + seconds
+        if environment is None:
+            return ()
+        with closing(environment):
+            first = _first_rows(environment, spec)
+            is_known = time.monotonic() < until
+            is_repeated = is_known and _alike(first, _first_rows(environment, spec))
+            found.append(_fixed_start(environment, spec, seconds))
+        if is_repeated:  # else gymnasium's checker says so
+            with closing(make(modules)) as environment:  # pyright: ignore[reportArgumentType]  # the first was made
+                found.append(_own_task(first, _first_rows(environment, spec), spec))
+    return tuple(filter(None, found))
+
+
+def _own_task(rows: list[np.ndarray], others: list[np.ndarray], spec: EnvironmentSpec) -> str:
+    """Return a warning if two environments with one seed play differently, though each repeats its own episode."""
+    if _alike(rows, others):
+        return ""
+    return (
+        f"environment {spec.id}: two of them with the same seed play differently, though each repeats its own "
+        "episode: its constructor draws what the seed does not decide, so that every environment of training "
+        "and of evaluations has a task of its own; draw it in reset, from "
+        f"{'a generator with its seed' if spec.is_game else 'self.np_random'}"
+    )
 
 
 _SEEDS, _UNSEEDED = 3, 10  # resets; a chance of two starts repeats one so often once in a thousand environments
 
 
-def fixed_start(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> str:
+def _fixed_start(environment: gymnasium.Env | GameEnvironments, spec: EnvironmentSpec, seconds: float) -> str:
     """Return a warning if resets without a seed all begin alike, though the seed changes how an episode begins.
 
-    Only the first episode of an environment has a seed in training, as usual; in evaluations each has one. Returns an
-    empty string also if that cannot be known within `seconds`. For the arguments see `own_task`.
+    Only the first episode of an environment has a seed in training, as usual; in evaluations each has one.
     """
-    until, starts = time.monotonic() + seconds, list[list[np.ndarray]]()
-    spec = spec.model_copy(update={"agent_ids": False})
-    with suppress(Exception, SystemExit):  # of the user's code; playing reports it
-        environment = make_games(spec, 1, modules) if spec.is_game else make_single(spec, modules)
-        if environment is None:
+    begin, until = _beginning(environment, spec), time.monotonic() + seconds
+    starts = list[list[np.ndarray]]()
+    for number in range(_SEEDS + _UNSEEDED):
+        if time.monotonic() > until:
             return ""
-        with closing(environment):
-            begin = _beginning(environment, spec)
-            for seed in (*range(_SEEDS), *[None] * _UNSEEDED):
-                if time.monotonic() > until:
-                    return ""
-                starts.append(begin(seed))
-        seeded, unseeded = starts[:_SEEDS], starts[_SEEDS:]
-        if all(_equal(each, seeded[0]) for each in seeded) or not all(_equal(each, unseeded[0]) for each in unseeded):
+        starts.append(begin(number if number < _SEEDS else None))
+        if number == _SEEDS - 1 and all(_equal(each, starts[0]) for each in starts):
+            return ""  # the same with every seed
+        if number > _SEEDS and not _equal(starts[number], starts[_SEEDS]):
             return ""
-        return (
-            f"environment {spec.id}: all episodes that reset begins without a seed begin alike, but those with seeds "
-            "differ: training gives a seed to the first episode of each environment only, and so plays one start, "
-            "while evaluations play others; seed the generator of random numbers only where reset gets a seed"
-        )
-    return ""
+    return (
+        f"environment {spec.id}: all episodes that reset begins without a seed begin alike, but those with seeds "
+        "differ: training gives a seed to the first episode of each environment only, and so plays one start, "
+        "while evaluations play others; seed the generator of random numbers only where reset gets a seed"
+    )
 
 
 def _beginning(
@@ -215,17 +211,13 @@ def _beginning(
 
     if isinstance(environment, GameEnvironments):
         (copy,) = environment.copies_for(environment.agents)
-        return lambda seed: shown(outcome.observation for outcome in copy.reset(seed))
+        seen = partial(numbered, number=0) if spec.agent_ids else lambda observation: observation
+        return lambda seed: shown(seen(outcome.observation) for outcome in copy.reset(seed))
     return lambda seed: shown([environment.reset(seed=seed)[0]])
 
 
 def _equal(start: list[np.ndarray], other: list[np.ndarray]) -> bool:
     return len(start) == len(other) and all(map(np.array_equal, start, other))
-
-
-def seed_warnings(spec: EnvironmentSpec, modules: UserModules, seconds: float) -> tuple[str, ...]:
-    """Return what is wrong with how an environment uses its seed; each part takes about `seconds` at most."""
-    return tuple(filter(None, (own_task(spec, modules, seconds), fixed_start(spec, modules, seconds))))
 
 
 def _first_rows_of_seats(games: GameEnvironments, spec: EnvironmentSpec) -> list[np.ndarray]:
