@@ -94,7 +94,9 @@ def resumed_run(
         with suppress(NoPolicyError, DamagedError):  # the learner reports a damaged checkpoint
             if difference := other_spaces(find_policy(choice.directory, newest=True), environment, spaces):
                 raise SettingsError(f"the environment is another than that of the run: {difference}")
-    run_directory.change_config(choice.directory, spec)
+    # A learner may refuse the settings; a run that is only evaluated has none.
+    write = run_directory.change_config if finished is None else run_directory.write_config
+    write(choice.directory, spec)
     return LocalRun(
         directory=lock.directory,
         spec=spec,
