@@ -50,7 +50,8 @@ from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.target_confirmation import Player
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_modules import NetworkError, UserModules, allow_settings, allow_words, modules_of, shown_path
+from daedalus.policy.user_code import shown_path
+from daedalus.policy.user_modules import NetworkError, UserModules, allow_settings, allow_words, modules_of
 from daedalus.protocol.algorithms import AlgorithmError
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec

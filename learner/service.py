@@ -25,7 +25,7 @@ from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.events import STOPPED_BY, EventFile
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.target_confirmation import Player, TargetConfirmation
-from daedalus.policy.user_modules import shown_path
+from daedalus.policy.user_code import shown_path
 from daedalus.protocol.messages import RunStatus
 from daedalus.transport.interface import Transport
 

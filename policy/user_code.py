@@ -10,7 +10,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from daedalus.policy.user_modules import shown_path
 from daedalus.protocol.texts import printable
 
 _NOT_OF_USERS = {"daedalus", "gymnasium", "numpy", "torch", *sys.stdlib_module_names}  # packages
@@ -38,6 +37,11 @@ def frames_of(error: BaseException | None) -> Iterator[TracebackType]:
 def is_of_user(frame: TracebackType) -> bool:
     """Return whether a frame runs code of the user, or of a package that it uses."""
     return frame.tb_frame.f_globals.get("__name__", "").partition(".")[0] not in _NOT_OF_USERS
+
+
+def shown_path(path: str) -> str:
+    """Return a path, relative to the working directory if it lies there."""
+    return path.removeprefix(os.path.join(os.getcwd(), ""))
 
 
 def place_of(error: BaseException | None) -> str:

@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from daedalus.policy.user_code import shown_path
+
 
 class NetworkError(Exception):
     """The network of a PolicySpec cannot be built for the spaces; the message says why and what to do."""
@@ -241,11 +243,6 @@ def refuse_while_imported(function: str) -> None:
             f"{function} is called while {name} is imported, which the processes of the run do, too: "
             'put the call under `if __name__ == "__main__":`'
         )
-
-
-def shown_path(path: str) -> str:
-    """Return a path, relative to the working directory if it lies there."""
-    return path.removeprefix(os.path.join(os.getcwd(), ""))
 
 
 def file_of(module: ModuleType) -> str:

@@ -128,6 +128,7 @@ def test_no_decision_depends_on_the_system_clock() -> None:
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
+        ("cli.main", {"numpy", "pydantic"}),  # the command may be a process of its own
         ("cli.commands.actor", {"torch", "daedalus.learner", "daedalus.algorithms"}),
         ("cli.commands.evaluate", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
         ("cli.commands.learner", {"torch", "daedalus.actor", "gymnasium"}),

@@ -24,7 +24,7 @@ from daedalus.learner.training.checkpoint import EncodedCheckpoint, encode_check
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import TrainingScore
 from daedalus.policy.saving.saved_policy import checkpoint_path
-from daedalus.policy.user_modules import shown_path
+from daedalus.policy.user_code import shown_path
 
 _logger = logging.getLogger(__name__)
 
