@@ -22,6 +22,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+# No plugin of pydantic is installed. Each process would look for one in the metadata of all packages.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+
 gc.disable()  # until all tests are collected: what is imported is kept, and nothing of it need be looked at
 
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
