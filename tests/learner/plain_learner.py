@@ -62,7 +62,7 @@ class PlainLearner:
         bonus: float,
     ) -> dict[str, float]:
         spec = self.spec
-        log_probs, entropies, values = self._play_back(batch)
+        log_probs, entropies, values = self._play_back(batch, cells)
         advantages = torch.tensor([targets[cell][1] for cell in cells])
         if spec.normalize_advantages:
             whole = torch.tensor([advantage for _, advantage, _ in targets.values()])  # of the batch
@@ -105,13 +105,19 @@ class PlainLearner:
             "value_mean": predicted.mean().item(),
         }
 
-    def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:
-        """Return log-probabilities, entropies and values by cell, from one forward pass per row."""
+    def _play_back(self, batch: Batch, cells: list[Cell] | None = None) -> tuple[Played, Played, Played]:
+        """Return log-probabilities, entropies and values by cell, from one forward pass per row.
+
+        `cells` are those that are needed (default: all). A memory also needs the other rows of their environments.
+        """
         log_probs, entropies, values = {}, {}, {}
         rows, environments = batch.rewards.shape
+        needed = None if cells is None else {b if self.network.state_size else (t, b) for t, b in cells}
         for b in range(environments):
             state = batch.initial_state[b : b + 1]
             for t in range(rows + 1):
+                if needed is not None and not {b, (t, b)} & needed:
+                    continue
                 if batch.starts[t, b]:
                     state = torch.zeros_like(state)
                 seen = {name: values[t, b : b + 1] for name, values in batch.observations.items()}

@@ -25,7 +25,7 @@ from daedalus.policy.saving.saved_policy import read_policy
 from daedalus.policy.saving.sealed import SealedDirectory, write_sealed
 from daedalus.protocol.spec import EnvironmentSpec
 
-OBSERVATIONS = 1000
+OBSERVATIONS = 300
 
 
 class Case(NamedTuple):
@@ -148,10 +148,12 @@ def test_file_chooses_the_actions_of_the_policy(tmp_path: Path, name: str) -> No
             if leaf.space.dtype == np.uint8:  # rows of a different brightness: all noise would look the same
                 image = leaf.of(observation)
                 image >>= random.integers(0, 8, (len(image), 1, 1), np.uint8)
-        seen.add(str(player.act(observation, action_mask=mask)))
+        action = player.act(observation, action_mask=mask)
+        if number % 10 == 0:
+            seen.add(str(action))
     repeat = policy.spec.environment.action_repeat
     assert (player.choices, player.different) == (
-        (2 if images else 10) * -(-100 // repeat),
+        (2 if images else 3) * -(-100 // repeat),
         0,
     )  # the numbers of an action to 1e-5
     assert len(seen) > 1 or name in ("pong", "car_racing_article")  # to whose networks all noise looks alike

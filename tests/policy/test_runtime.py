@@ -1,9 +1,10 @@
 """All runtimes choose the same actions; faulty programs and weights raise PolicyError."""
 
+import functools
+import itertools
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -79,27 +80,24 @@ def tolerance(logits: torch.Tensor) -> float:
 # -------------------------------------------------------------------------------------------- agreement
 
 
-@pytest.mark.parametrize("random", [generator, lambda: None], ids=["sampled", "greedy"])
-@pytest.mark.parametrize("rows", [1, 17])
-def test_all_runtimes_choose_the_same_actions(
-    policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]
-) -> None:
+def test_all_runtimes_choose_the_same_actions(policy: Policy) -> None:
     with_onnx, with_torch, for_few_rows = policy.runtimes()
     for seed in (0, 1):  # also after weights are replaced
-        results = []
         for runtime in (with_torch, with_onnx, for_few_rows):
             runtime.load(policy.weights(seed))
-            results.append(act(runtime, policy.observations(rows), policy.states(rows), random()))
-        torch_actions, torch_log_probs, torch_state = results[0]
         policy.load(policy.weights(seed))
-        logits, _ = learner_outputs(policy, policy.observations(rows), policy.states(rows))
-        for actions, log_probs, state in results[1:]:
-            assert (actions.shape, actions.dtype) == ((rows,), np.int64)
-            assert (log_probs.shape, log_probs.dtype) == ((rows,), np.float32)
-            assert (state.shape, state.dtype) == ((rows, policy.network.state_size), np.float32)
-            np.testing.assert_array_equal(actions, torch_actions)
-            np.testing.assert_allclose(log_probs, torch_log_probs, atol=tolerance(logits), rtol=0)
-            np.testing.assert_allclose(state, torch_state, atol=5e-5, rtol=0)
+        for rows, random in itertools.product((1, 17), (generator, lambda: None)):  # sampled and greedy
+            seen, states = policy.observations(rows), policy.states(rows)
+            logits, _ = learner_outputs(policy, seen, states)
+            torch_actions, torch_log_probs, torch_state = act(with_torch, seen, states, random())
+            for runtime in (with_onnx, for_few_rows):
+                actions, log_probs, state = act(runtime, seen, states, random())
+                assert (actions.shape, actions.dtype) == ((rows,), np.int64)
+                assert (log_probs.shape, log_probs.dtype) == ((rows,), np.float32)
+                assert (state.shape, state.dtype) == ((rows, policy.network.state_size), np.float32)
+                np.testing.assert_array_equal(actions, torch_actions)
+                np.testing.assert_allclose(log_probs, torch_log_probs, atol=tolerance(logits), rtol=0)
+                np.testing.assert_allclose(state, torch_state, atol=5e-5, rtol=0)
 
 
 def test_state_is_carried_from_row_to_row(policy: Policy) -> None:
@@ -196,7 +194,12 @@ def test_program_depends_only_on_the_architecture(policy: Policy) -> None:
             torch.nn.init.normal_(parameter) if value is None else torch.nn.init.constant_(parameter, value)
         again = export_program(policy.network, policy.spaces)
         assert program_hash(again) == program_hash(policy.program)
-    assert program_hash(make_policy({"hidden": (5,)}, spaces((2,), "float32")).program) != program_hash(policy.program)
+    assert program_hash(another_program()) != program_hash(policy.program)
+
+
+@functools.cache
+def another_program() -> bytes:
+    return make_policy({"hidden": (5,)}, spaces((2,), "float32")).program
 
 
 def test_hash_of_a_program_is_sha256() -> None:
