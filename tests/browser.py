@@ -31,6 +31,14 @@ def chromium() -> Iterator[Any]:
             browser.close()
 
 
+def in_both_schemes(page: Any) -> Iterator[str]:
+    """Show a page in light, then in dark: styles alone depend on the scheme, so it need not be loaded twice."""
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        assert page.evaluate(f"matchMedia('(prefers-color-scheme: {scheme})').matches")
+        yield scheme
+
+
 class Visit:
     """A page in a browser, with what it complained about and which other hosts it asked."""
 

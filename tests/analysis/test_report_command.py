@@ -1,11 +1,14 @@
 """Test of `daedalus report`: what the file shows, and that nothing in a run directory becomes markup."""
 
+import copy
 import csv
 import json
 import os
+import pickle
 import re
 import tomllib
-from collections.abc import Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,26 @@ RETURNS = [400.0, 480.0, 490.0, 500.0, 500.0, 500.0, 500.0, 100.0]
 GIF = (
     b"GIF89a\x01\x00\x01\x00\x80\x00\x00\x00\x00\x00\xff\xff\xff,\x00\x00\x00\x00\x01\x00\x01\x00\x00\x02\x02D\x01\x00;"
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def drawn_once() -> Iterator[None]:
+    """Draw equal charts once: most tests are about the rest of the page, and matplotlib takes most of the time."""
+    drawn: dict[bytes, ET.Element] = {}
+
+    def once(draw: Callable[..., ET.Element]) -> Callable[..., ET.Element]:
+        def chart(*arguments: Any, **options: Any) -> ET.Element:
+            key = pickle.dumps((draw.__name__, arguments, options))
+            if key not in drawn:
+                drawn[key] = draw(*arguments, **options)
+            return copy.deepcopy(drawn[key])
+
+        return chart
+
+    with pytest.MonkeyPatch.context() as patch:
+        for draw in (run_report.line_chart, run_report.histogram):
+            patch.setattr(run_report, draw.__name__, once(draw))
+        yield
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import AXE, chromium
+from browser import AXE, chromium, in_both_schemes
 from league_statuses import LEAGUE
 from recorded_runs import record
 from test_report_command import GIF, HOSTILE, evaluated, happened
@@ -48,10 +48,10 @@ def reports(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> list[Path
     return [rich / "report.html", poor / "report.html", folder / "report.html", game / "report.html"]
 
 
-@pytest.fixture(params=["light", "dark"])
-def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
-    """Function that opens a file, in light and in dark, without a network. No page may complain or load anything."""
-    context = browser.new_context(color_scheme=request.param, offline=True)
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Any]:
+    """Function that opens a file without a network. No page may complain or load anything."""
+    context = browser.new_context(offline=True)
     page = context.new_page()
     complaints: list[str] = []
     page.on("console", lambda message: complaints.append(message.text))
@@ -72,10 +72,12 @@ def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
 def test_the_page_shows_what_it_has_without_network(reports: list[Path], opened: Any, index: int) -> None:
     page = opened(reports[index])
     assert page.locator("figure svg").count() >= 4
-    text = page.locator("figure svg text").first
-    assert text.evaluate("each => getComputedStyle(each).fill") == text.evaluate(
-        "each => getComputedStyle(document.querySelector('footer')).color"
-    )
+    text, colours = page.locator("figure svg text").first, set()
+    for _ in in_both_schemes(page):
+        colour = text.evaluate("each => getComputedStyle(each).fill")
+        colours.add(colour)
+        assert colour == text.evaluate("each => getComputedStyle(document.querySelector('footer')).color")
+    assert len(colours) == 2
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     page.set_viewport_size({"width": 360, "height": 740})
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
@@ -111,5 +113,6 @@ def test_axe_finds_nothing(reports: list[Path], opened: Any, index: int) -> None
     page = opened(reports[index])
     page.evaluate("document.querySelectorAll('details').forEach(each => each.open = true)")
     page.evaluate(AXE.read_text("utf-8"))
-    found = page.evaluate("async () => (await axe.run()).violations")
-    assert [f"{each['id']}: {node['html'][:150]}" for each in found for node in each["nodes"]] == []
+    for scheme in in_both_schemes(page):
+        found = page.evaluate("async () => (await axe.run()).violations")
+        assert [f"{each['id']}: {node['html'][:150]}" for each in found for node in each["nodes"]] == [], scheme
