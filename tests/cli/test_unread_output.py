@@ -1,6 +1,7 @@
 """Commands whose output is not read to its end, as in `daedalus status | head`, or cannot be encoded."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,15 @@ from recorded_runs import record
 from daedalus.launch.process_lifecycle import UNREAD, exit_status
 
 PROGRAM = "from daedalus.cli.main import main; raise SystemExit(main())"
+# Runs the commands of its argument, a list of their words, in turn.
+EACH = """
+import ast, sys
+from daedalus.cli.main import main
+
+for words in ast.literal_eval(sys.argv[1]):
+    sys.argv[1:] = words
+    print("status", main(), flush=True)
+"""
 
 
 @pytest.mark.parametrize("words", [("completion", "bash"), ("--help",)])
@@ -70,28 +80,27 @@ NAME = (
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8", "latin-1:strict"])
 def test_a_command_prints_any_path_in_characters_that_its_output_has(tmp_path: Path, encoding: str) -> None:
     variables = {**os.environ, "PYTHONIOENCODING": encoding, "LC_ALL": "C.UTF-8"}
-
-    def run(*words: str) -> tuple[int, str]:
-        command = [sys.executable, "-P", "-c", PROGRAM, *words]
-        ended = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, check=False)
-        text = (ended.stdout + ended.stderr).decode(encoding.partition(":")[0])
-        assert "Traceback" not in text
-        assert all(line.isprintable() for line in text.split("\n")), text
-        return ended.returncode, text
-
+    commands = [(0, "compare", NAME, "--csv", f"{NAME}.csv")]
+    if encoding == "ascii":  # the others print in the same ways
+        commands += [
+            (0, "report", NAME),
+            (0, "plot", NAME, "--output", f"{NAME}.png"),
+            (2, "resume", f"{NAME}-missing"),
+            (1, "status", "--alive", f"{NAME}-missing"),
+        ]
+    commands += [(1, "evaluate", f"{NAME}-missing")]  # last: its process replaces this one
     record(tmp_path / NAME)
-    status, text = run("report", NAME)
-    assert (status, text.strip()) == (
-        0,
-        r"wrote r\xe9\udcff\u202e\u2028$x\x1b[2J/report.html".replace(r"\xe9", r"\xe9" if encoding == "ascii" else "é"),
-    )
-    page = (tmp_path / NAME / "report.html").read_text("utf-8")
-    assert all(character.isprintable() or character == "\n" for character in page)
-    assert run("evaluate", f"{NAME}-missing")[0] == 1
-    if encoding != "ascii":  # the commands below print in the same ways
-        return
-    assert run("plot", NAME, "--output", f"{NAME}.png")[0] == 0
-    assert run("compare", NAME, "--csv", f"{NAME}.csv")[0] == 0
+    command = [sys.executable, "-P", "-c", EACH, *(ascii([list(words) for _, *words in commands]),)]
+    ended = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, check=False)
+    text = (ended.stdout + ended.stderr).decode(encoding.partition(":")[0])
+    assert "Traceback" not in text
+    assert all(line.isprintable() for line in text.split("\n")), text
+    *statuses, last = (status for status, *_ in commands)
+    assert (re.findall(r"^status (\d+)$", text, re.MULTILINE), ended.returncode) == ([*map(str, statuses)], last), text
+    shown = r"r\xe9\udcff\u202e\u2028$x\x1b[2J".replace(r"\xe9", r"\xe9" if encoding == "ascii" else "é")
+    assert f"\n{shown} " in text.partition("status ")[0]  # in the table of `compare`
     assert all(line.isprintable() for line in (tmp_path / f"{NAME}.csv").read_text("utf-8").splitlines())
-    assert run("resume", f"{NAME}-missing")[0] == 2
-    assert run("status", "--alive", f"{NAME}-missing")[0] == 1
+    if encoding == "ascii":
+        assert f"wrote {shown}/report.html\n" in text
+        page = (tmp_path / NAME / "report.html").read_text("utf-8")
+        assert all(character.isprintable() or character == "\n" for character in page)
