@@ -63,16 +63,25 @@ def drive() -> tuple[int, list[int], int]:
     return 11, actions, 240
 
 
-def test_late_rendering_gives_the_same_episodes_and_frames(drive: tuple[int, list[int], int]) -> None:
-    original, ours = _original(*drive), _ours("gymnasium", *drive)
+@pytest.fixture(scope="module")
+def original(drive: tuple[int, list[int], int]) -> list[tuple]:
+    return _original(*drive)
+
+
+def test_late_rendering_gives_the_same_episodes_and_frames(
+    drive: tuple[int, list[int], int], original: list[tuple]
+) -> None:
+    ours = _ours("gymnasium", *drive)
     assert [row[1:] for row in ours] == [row[1:] for row in original]
     assert original[-1][3]
     for one, other in zip(ours, original, strict=True):
         np.testing.assert_array_equal(one[0], other[0])
 
 
-def test_fast_renderer_gives_the_same_episodes_and_similar_frames(drive: tuple[int, list[int], int]) -> None:
-    original, ours = _original(*drive), _ours("fast", *drive)
+def test_fast_renderer_gives_the_same_episodes_and_similar_frames(
+    drive: tuple[int, list[int], int], original: list[tuple]
+) -> None:
+    ours = _ours("fast", *drive)
     assert [row[1:] for row in ours] == [row[1:] for row in original]
     different = [np.abs(one[0][ROAD].astype(int) - other[0][ROAD]) for one, other in zip(ours, original, strict=True)]
     assert max(difference.mean() for difference in different) < 3.0
