@@ -383,8 +383,10 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
     write_config(run, spec)
     newest = max(version for version in (1, 2, 3) if version != worst)
     evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event(), output)
-    evaluation = read_json(run / "summary.json")["evaluation"]
+    summary = read_json(run / "summary.json")
+    evaluation = summary["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
+    assert "sampled_evaluation" not in summary  # no training episode has ended, which these could be worse than
     scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["select_best"]]
     assert [version for version, _ in scores] == [newest, worst]
     assert evaluate(run, "--episodes", 1)["policy_version"] == newest
@@ -408,11 +410,10 @@ def test_new_sampled_episodes_that_confirmed_the_target_are_reported(tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("training_mean", "limit", "plays_again"),
-    [(1000.0, None, True), (1.0, None, False), (None, None, False), (1000.0, 400, False)],
+    ("training_mean", "limit", "plays_again"), [(1000.0, None, True), (1.0, None, False), (1000.0, 400, False)]
 )
 def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_sampled_actions(
-    tmp_path: Path, output: ChildOutput, training_mean: float | None, limit: int | None, plays_again: bool
+    tmp_path: Path, output: ChildOutput, training_mean: float, limit: int | None, plays_again: bool
 ) -> None:
     """Not where training played another task, as with no_reward_limit: its returns say nothing then."""
     environment = CARTPOLE.model_copy(update={"no_reward_limit": limit})
