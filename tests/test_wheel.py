@@ -59,6 +59,7 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     packages = installed(folder, wheel)
     (packages / "launch").mkdir()
     (packages / "launch" / "__init__.py").write_text(RAISES)
+    (packages / "matplotlib.py").write_text("raise ModuleNotFoundError\n")  # no report, which takes a second
     return folder / "bin"
 
 
@@ -134,6 +135,7 @@ def test_train_works_beside_packages_and_scripts_of_the_same_names(environment: 
         environment / "daedalus", "train", "cartpole", "--actors", "1", *settings, "--run-dir", name, folder=scripts
     )
     assert "evaluation: return" in output
+    assert "for a report with the curves: pip install" in output
 
 
 def test_uvx_runs_the_distribution_by_its_name(uv: Callable[..., subprocess.CompletedProcess[str]]) -> None:
