@@ -108,20 +108,6 @@ def starting(folder: Path) -> Iterator[Callable[..., Running]]:
             one.end()
 
 
-@contextmanager
-def without_training() -> Iterator[None]:
-    """Let learners that are started in the block let actors join and answer them, and no more.
-
-    A learner imports torch when actors can join, which takes most of the time of a short one. Here that import waits.
-    """
-    before = os.environ.get("PYTHONPATH", "")
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent / "idle_torch"), *filter(None, [before])])
-    try:
-        yield
-    finally:
-        os.environ["PYTHONPATH"] = before
-
-
 def free_address() -> str:
     """Return a loopback address that no process listens on.
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import DAEDALUS, LIMIT, Running, until, without_training
+from processes import DAEDALUS, LIMIT, Running, until
 
 from daedalus.cli.command_table import COMMANDS
 
@@ -125,8 +125,7 @@ def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_
 
 
 def test_an_address_in_use_is_reported(start: Start, address: str, tmp_path: Path) -> None:
-    with without_training():
-        first = start("learner", "cartpole", "--listen", address, "--run-dir", "one")
+    first = start("learner", "cartpole", "--listen", address, "--run-dir", "one")
     first.expect("actors join with")
     second = start("learner", "cartpole", "--listen", address, "--run-dir", "two")
     assert second.wait() == 1

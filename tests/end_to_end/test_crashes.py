@@ -3,11 +3,10 @@
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from processes import LIMIT, Running, without_training
+from processes import LIMIT, Running
 
 Start = Callable[..., Running]
 
@@ -53,9 +52,9 @@ def test_an_exception_in_a_thread_of_the_learner_ends_it(
     thread: str, start: Start, address: str, tmp_path: Path
 ) -> None:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**12)
-    words = ("cartpole", "--listen", address, "--run-dir", "run", *endless)
-    with nullcontext() if thread == "intake" else without_training():
-        learner = Faulty(tmp_path, "learner", LEARNER_FAULTS[thread], *words)
+    learner = Faulty(
+        tmp_path, "learner", LEARNER_FAULTS[thread], "cartpole", "--listen", address, "--run-dir", "run", *endless
+    )
     actor = start("actor", "--connect", address)
     learner.assert_crashes()
     assert actor.process.poll() is None  # it looks for the learner that a supervisor would restart

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from installing import build, installed, run
-from processes import DAEDALUS, ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, until, without_training
+from processes import DAEDALUS, ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, until
 
 from daedalus.learner.run.setting_errors import known_names
 from daedalus.protocol.releases import REPLACED_SETTINGS, own_release
@@ -102,9 +102,8 @@ def test_a_setting_that_went_is_named_with_what_replaced_it() -> None:
 def test_too_old_processes_name_the_release_that_they_need(start: Start, address: str) -> None:
     later, own = [*DAEDALUS[:-1], LATER], own_release()
     start("router", "--listen", address).expect("listening")
-    with without_training():
-        learner = start("learner", "cartpole", "--connect", address, "--run-dir", "later", command=later)
-        ours = start("learner", "cartpole", "--connect", address, "--run-dir", "ours")
+    learner = start("learner", "cartpole", "--connect", address, "--run-dir", "later", command=later)
+    ours = start("learner", "cartpole", "--connect", address, "--run-dir", "ours")
     reason = f"{own} cannot read messages of daedalus-rl 9.9: upgrade the end that has {own} to daedalus-rl 9.9"
     learner.expect("serving run")
     ours.expect("serving run")

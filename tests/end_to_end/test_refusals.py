@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from plain import vector_spaces
-from processes import LIMIT, Running, free_address, starting, until, without_training
+from processes import LIMIT, Running, free_address, starting, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -27,7 +27,7 @@ Start = Callable[..., Running]
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Transport]:
     """Transport of a client that is connected to a running learner, which the tests share."""
     address = free_address()
-    with starting(tmp_path_factory.mktemp("learner")) as start, without_training():
+    with starting(tmp_path_factory.mktemp("learner")) as start:
         learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
         learner.expect("actors join with")
         with closing(connect([address])) as transport:
@@ -69,8 +69,7 @@ def test_a_foreign_join_that_comes_first_does_not_decide_the_spaces(client: Tran
 
 def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(start: Start, address: str) -> None:
     slow = ("--set", "environment.kwargs.seconds=0.1", "--set", "collection.envs_per_actor=1")
-    with without_training():
-        learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run", *slow)
+    learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run", *slow)
     learner.expect("actors join with")
     actor = ("actor", "--connect", address, "--name", "arm", "--allow-module", "slow_environment")
     first = start(*actor)
@@ -87,8 +86,7 @@ def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(s
 
 def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str) -> None:
     with closing(listen([address])) as router:
-        with without_training():
-            first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
+        first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
         first.expect("actors join with")
         until(lambda: router.query(keys.join("run", "client"), timeout=30.0))
         second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
@@ -102,8 +100,7 @@ def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_th
 ) -> None:
     """The module is not in the learner's folder: the first actor decides the spaces."""
     (tmp_path / "slow_environment.py").unlink()
-    with without_training():
-        learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run")
+    learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run")
     learner.expect("the first actor decides the spaces of the run, because .* cannot import slow_environment")
     learner.expect("actors join with")
     with closing(connect([address])) as transport:

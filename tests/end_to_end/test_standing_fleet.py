@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until, without_training
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -113,8 +113,7 @@ def test_a_standing_actor_outlives_a_run_that_it_cannot_play_and_another_release
             foreign.serve(keys.join("foreign", "*"), lambda request: request.reply(bytes(newer)))
             actor.expect("the other end uses protocol version .*; trying again")
         theirs = ("--env", "slow_environment:Slow-v0", "--set", "environment.package=slow-games==1.2")
-        with without_training():
-            first = start("learner", *theirs, "--connect", address, "--run-dir", "theirs")
+        first = start("learner", *theirs, "--connect", address, "--run-dir", "theirs")
         actor.expect('slow_environment is not installed here; .*: pip install "slow-games==1.2"; trying again')
         first.expect("failed .*slow_environment")
         first.end()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from certificates import change_certificates, make_certificates
-from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until, without_training
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
 
 Start = Callable[..., Running]
 
@@ -71,8 +71,7 @@ def test_mistakes_with_certificates_are_reported_in_one_line(
     start: Start, tls: str, certificates: Path, tmp_path: Path
 ) -> None:
     strange = make_certificates(tmp_path / "strange")
-    with without_training():
-        learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
+    learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
     learner.expect("actors join with")
     to = ("actor", "--connect", tls)
     for arguments, status, message in (
