@@ -17,7 +17,14 @@ from processes import Running, free_address, processes_mentioning, until
 from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
-SIZES = ("collection.actors=1", "collection.envs_per_actor=2", "collection.rollout_length=8", "training.minibatches=1")
+# Not in processes of their own, as on a busy machine: environments know an evaluation by the process's command.
+SIZES = (
+    "environment.processes=false",
+    "collection.actors=1",
+    "collection.envs_per_actor=2",
+    "collection.rollout_length=8",
+    "training.minibatches=1",
+)
 TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=0")
 WORDS = [word for each in (*SIZES, *TARGET) for word in ("--set", each)]
 
@@ -51,7 +58,9 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     (tmp_path / UNLUCKY).touch()
     running = train()
     assert running.wait() == 0, running.output
-    first, second = (index for index, line in enumerate(running.lines) if line.startswith("target 1 reached: "))
+    reached = [index for index, line in enumerate(running.lines) if line.startswith("target 1 reached: ")]
+    assert len(reached) == 2, running.output + (tmp_path / "run/events.jsonl").read_text()
+    first, second = reached
     assert any(line.startswith(NOT_YET) for line in running.lines[first:second])
     result = summary(tmp_path)
     assert (result["solved"], result["finished"], result["confirmation_return_mean"]) == (True, True, 1.0)
