@@ -246,7 +246,6 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     """
     open_standard_streams()
     gc.freeze()  # what has been imported: the interpreter would look through it again, also at its end
-    gc.enable()  # see daedalus.cli.commands
     before = set(threading.enumerate())
     try:
         try:
