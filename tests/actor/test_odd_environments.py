@@ -138,7 +138,8 @@ def test_environments_do_not_share_what_their_constructor_changes_in_place() -> 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_seeds_of_training_fit_an_int_of_c(seed: int) -> None:
-    collect(started_collector(spec(), First(), count=2, rollout_length=4, seed=seed, modules=MODULES))
+    rollout = collect(started_collector(spec(), First(), count=2, rollout_length=4, seed=seed, modules=MODULES))
+    assert (rollout.rows, rollout.environments) == (4, 2)
 
 
 class Simulator(gymnasium.Env[Any, Any]):
