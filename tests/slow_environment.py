@@ -1,11 +1,10 @@
-"""CartPole and Pendulum with slow steps."""
+"""CartPole and Reacher with slow steps."""
 
 import time
 from typing import Any
 
 import gymnasium
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
-from gymnasium.envs.classic_control.pendulum import PendulumEnv
 
 
 class Slow(CartPoleEnv):
@@ -20,17 +19,22 @@ class Slow(CartPoleEnv):
         return super().step(action)
 
 
-class SlowPendulum(PendulumEnv):
-    """Pendulum whose steps take `seconds`, as those of a simulator."""
+class SlowSteps(gymnasium.Wrapper):
+    """An environment whose steps take `seconds`, as those of a simulator."""
 
-    def __init__(self, seconds: float = 0.05, **arguments: Any) -> None:
-        super().__init__(**arguments)
+    def __init__(self, environment: gymnasium.Env, seconds: float) -> None:
+        super().__init__(environment)
         self._seconds = seconds
 
-    def step(self, u: Any) -> Any:
+    def step(self, action: Any) -> Any:
         time.sleep(self._seconds)
-        return super().step(u)
+        return super().step(action)
+
+
+def slow_reacher(seconds: float = 0.05, **arguments: Any) -> gymnasium.Env:
+    """Reacher with slow steps. It needs MuJoCo."""
+    return SlowSteps(gymnasium.make("Reacher-v5", **arguments).unwrapped, seconds)
 
 
 gymnasium.register("Slow-v0", Slow, max_episode_steps=500)
-gymnasium.register("SlowPendulum-v0", SlowPendulum, max_episode_steps=200)
+gymnasium.register("SlowReacher-v0", slow_reacher, max_episode_steps=50)
