@@ -1,5 +1,7 @@
-"""Soft actor-critic: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", algorithm 1. For a choice
-in place of continuous actions: Christodoulou (2019), "Soft Actor-Critic for Discrete Action Settings".
+"""Soft actor-critic: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", algorithm 1, with the
+critics of Kuznetsov et al. (2020), "Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional
+Quantile Critics" (TQC). For a choice in place of continuous actions: Christodoulou (2019), "Soft Actor-Critic for
+Discrete Action Settings".
 
 The critics stay in the learner: the program and the snapshots of the actors are the policy alone.
 """
@@ -27,12 +29,16 @@ from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 
+QUANTILES = 25  # of each critic of continuous actions, as published
+DROPPED = 4  # the largest of those of both target critics
+
 
 class TwinCritics(nn.Module):
-    """Two critics Q_1(s, a) and Q_2(s, a) with layers of their own, computed at once, and one encoder of images.
+    """Two critics with layers of their own, computed at once, and one encoder of images.
 
-    Continuous actions are inputs. For a choice, the outputs are the values of all its actions. The convolutions of
-    images are the critics': the policy has a copy of them.
+    Continuous actions are inputs, and the outputs are quantiles of the return. For a choice, the outputs are the values
+    Q_1(s, a) and Q_2(s, a) of all its actions. The convolutions of images are the critics': the policy has a copy of
+    them.
 
     Attributes:
       choices: A, the number of actions of the choice; 0 if the actions are continuous.
@@ -46,7 +52,7 @@ class TwinCritics(nn.Module):
         choice = spaces.only_choice
         self.choices = 0 if choice is None else choice.choices
         actions = 0 if choice is not None else sum(space.size for space in spaces.actions.values())
-        sizes = [self.encoder.features + actions, *spec.hidden, self.choices or 1]
+        sizes = [self.encoder.features + actions, *spec.hidden, self.choices or QUANTILES]
         pairs = list(itertools.pairwise(sizes))
         # As torch initialises linear layers; [2, inputs, outputs] and [2, 1, outputs].
         self.weights = nn.ParameterList([_uniform(inputs, (2, inputs, outputs)) for inputs, outputs in pairs])
@@ -59,26 +65,24 @@ class TwinCritics(nn.Module):
         return prepared | {name: encoder.convolve(prepared[name], shifted=True) for name, encoder in encoders.items()}
 
     def forward(self, prepared: Components, actions: Tensor) -> Tensor:
-        """Return both values [2, B] of actions [B, D] in observations, each [B, *stacked_shape] or convolved."""
+        """Return quantiles [2, B, Q] of the returns after actions [B, D] in observations, or the values [2, B] of
+        chosen actions [B, 1]. The observations are each [B, *stacked_shape] or convolved."""
         if self.choices:
             return self.of_choices(prepared).gather(-1, actions.long().expand(2, *actions.shape)).squeeze(-1)
-        hidden, weight, bias = self._hidden(torch.cat([self.encoder(prepared).float(), actions], -1))
-        # In full precision, as the heads of ActorCritic. A product with a vector takes six times as long as this sum.
-        return (hidden.float() * weight.transpose(1, 2)).sum(-1) + bias.squeeze(-1)
+        return self._outputs(torch.cat([self.encoder(prepared).float(), actions], -1))
 
     def of_choices(self, prepared: Components) -> Tensor:
         """Return both values of all A actions of a choice [2, B, A] in observations, which are as in `forward`."""
-        hidden, weight, bias = self._hidden(self.encoder(prepared).float())
-        with full_precision(hidden):
-            return torch.baddbmm(bias, hidden.float(), weight)
+        return self._outputs(self.encoder(prepared).float())
 
-    def _hidden(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the outputs [2, B, F'] of all layers but the last, of [B, F], and the weight and bias of that one."""
+    def _outputs(self, features: Tensor) -> Tensor:
+        """Return the outputs [2, B, F'] of all layers, of [B, F]; of the last in full precision, as in ActorCritic."""
         hidden = features.expand(2, *features.shape)
         *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for inner_weight, inner_bias in layers:
             hidden = self._activate(torch.baddbmm(inner_bias, hidden, inner_weight))
-        return hidden, weight, bias
+        with full_precision(hidden):
+            return torch.baddbmm(bias, hidden.float(), weight)
 
     def rounded(self) -> "TwinCritics":
         """Return a copy in bfloat16, but for the last layer, which both share."""
@@ -100,13 +104,17 @@ ENTROPY_SHARE = 0.7
 class Sac(Algorithm):
     """Twin critics with target critics, a policy, and a temperature alpha that keeps the entropy of the policy.
 
-    The value of a policy is V(s) = E[min_i Q_i(s, a) - alpha log pi(a | s)], a ~ pi(s). With a transition of m rewards
-    R and discounts d (replay_buffer.py), both critics regress on R + d V-(s'), where V- has the target critics; the
-    policy ascends V(s); and log alpha descends log alpha (E[-log pi(a | s)] - H), where H is the target of the entropy.
-    All three gradients are those at the parameters before the update.
+    The value of a policy is V(s) = E[Q(s, a) - alpha log pi(a | s)], a ~ pi(s). With a transition of m rewards R and
+    discounts d (replay_buffer.py), both critics regress on R + d V-(s'), where V- has the target critics; the policy
+    ascends V(s); and log alpha descends log alpha (E[-log pi(a | s)] - H), where H is the target of the entropy. All
+    three gradients are those at the parameters before the update.
 
     Continuous actions are squashed Gaussian: each expectation is one reparameterised sample, and H = -D, of the actions
-    scaled to [-1, 1]. For a choice of A actions an expectation is the sum over all of them, and H a share of log A.
+    scaled to [-1, 1]. Q is the mean of all quantiles of both critics. The critics regress on the quantiles of both
+    target critics without the largest of them, so that values are not too high (section 3 of TQC).
+
+    For a choice of A actions an expectation is the sum over all of them, Q is the smaller of both values, and H a share
+    of log A.
     """
 
     record = ALGORITHMS["sac"]
@@ -219,15 +227,23 @@ class Sac(Algorithm):
     def _of_critics(
         self, now: Components, then: Components, actions: Tensor, rewards: Tensor, discounts: Tensor, noise: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return the gradient of the critics and their loss."""
+        """Return the gradient of the critics, and half the squared errors of their values (means of quantiles)."""
         with self._precision():
             with torch.no_grad():
                 by_targets = self._target_critics.convolve(then)
                 following, _ = self._values(self._target_critics, by_targets, self._critics.convolve(then), noise)
+                if not self._critics.choices:
+                    pooled = following.transpose(0, 1).flatten(1)
+                    kept = pooled.topk(2 * QUANTILES - DROPPED, largest=False, sorted=False)
+                    following = kept.values.T  # [M, B]
                 targets = rewards + discounts * following
-            values = self._critics(now, actions)  # [2, B]
-            value_loss = 0.5 * (values - targets).square().mean(-1).sum()
-        return _differentiated(value_loss, self._critic_parameters), value_loss.detach()
+            values = self._critics(now, actions)
+            if self._critics.choices:
+                loss = value_loss = 0.5 * (values - targets).square().mean(-1).sum()
+            else:
+                loss = quantile_loss(values, targets.T)
+                value_loss = 0.5 * (values.mean(-1) - targets.mean(0)).square().mean(-1).sum()
+        return _differentiated(loss, self._critic_parameters), value_loss.detach()
 
     def _of_policy(self, now: Components, noise: Tensor) -> tuple[Tensor, ...]:
         """Return the gradients of the policy and of the temperature, the loss and the entropy of the policy."""
@@ -241,7 +257,9 @@ class Sac(Algorithm):
     def _values(
         self, critics: TwinCritics, seen: Components, prepared: Components, noise: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the values V(s) by some critics, and the entropies of the policy, each [B].
+        """Return the values V(s) by some critics, and the entropies of the policy [B].
+
+        The values are [B] of a choice; of continuous actions [2, B, Q], one for each quantile in place of Q(s, a).
 
         Args:
           critics: the critics or their targets.
@@ -254,14 +272,15 @@ class Sac(Algorithm):
             with full_precision(features):
                 log_probs = self._network.policy_head(features).log_softmax(-1)  # [B, A]: its outputs are the logits
             first, second = critics.of_choices(seen).unbind()
-            expected = (log_probs.exp() * torch.minimum(first, second)).sum(-1)
+            values = (log_probs.exp() * torch.minimum(first, second)).sum(-1)
             entropies = -(log_probs.exp() * log_probs).sum(-1)
+            bonus = self._log_temperature.exp() * entropies
         else:
             with full_precision(features):
                 actions, log_probs = self.distribution.sample_and_log_prob(self._network.policy_head(features), noise)
-            first, second = critics(seen, actions).unbind()
-            expected, entropies = torch.minimum(first, second), -log_probs
-        return expected + self._log_temperature.exp() * entropies, entropies
+            values, entropies = critics(seen, actions), -log_probs
+            bonus = (self._log_temperature.exp() * entropies)[:, None]
+        return values + bonus, entropies
 
     def _precision(self) -> AbstractContextManager[object]:
         device = self._log_temperature.device.type
@@ -272,6 +291,21 @@ class Sac(Algorithm):
         self._targets.lerp_(self._flat.values, self._target_rate)
         for of_policy, of_critics, _ in self._convolutions:
             _copy(of_critics, of_policy)
+
+
+def quantile_loss(values: Tensor, targets: Tensor) -> Tensor:
+    """Return a number with the gradient of TQC's loss of quantiles [2, B, Q], for targets [B, M].
+
+    The loss is the mean over rows, quantiles and targets of |tau - 1(target < quantile)| h(target - quantile): tau
+    is the level of the quantile, h the loss of Huber with threshold 1. Those of both critics are added.
+    """
+    _, rows, quantiles = values.shape
+    with torch.no_grad():
+        clipped = (targets[:, None] - values[..., None]).clamp(-1.0, 1.0)  # [2, B, Q, M]
+        levels = (torch.arange(quantiles, device=values.device) + 0.5) / quantiles
+        # A positive error counts `levels` times, a negative one 1 - `levels` times.
+        slopes = -(0.5 * clipped.mean(-1) + (levels - 0.5) * clipped.abs().mean(-1)) / (rows * quantiles)
+    return (slopes * values).sum()
 
 
 def _differentiated(loss: Tensor, parameters: Sequence[Tensor]) -> Tensor:

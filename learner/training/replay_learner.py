@@ -70,8 +70,8 @@ class ReplayLearner(Learner):
 
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
         """See Learner. Raises CheckpointMismatchError also for critics that would give other values."""
-        known = {f"algorithm/{name}" for name in self._algorithm.statistics}
-        if any(name.startswith("algorithm/") and name not in known for name in state):
+        shapes = {f"algorithm/{name}": values.shape for name, values in self._algorithm.statistics.items()}
+        if any(name.startswith("algorithm/") and shapes.get(name) != values.shape for name, values in state.items()):
             raise CheckpointMismatchError(
                 "the critics of the run are those of an earlier version of Daedalus: go on with that, or begin a run "
                 "with its policy: --init-from RUN_DIRECTORY"

@@ -13,7 +13,7 @@ from daedalus.algorithms.forward import FlatParameters
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.recording import EARLIER_CALLS
 from daedalus.algorithms.replay_buffer import Transitions
-from daedalus.algorithms.sac import ENTROPY_SHARE, Sac, TwinCritics
+from daedalus.algorithms.sac import DROPPED, ENTROPY_SHARE, QUANTILES, Sac, TwinCritics, quantile_loss
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.convolutional import ImageEncoder, ImageLayout
 from daedalus.policy.network.distributions import SquashedGaussian
@@ -77,14 +77,14 @@ def transitions(seed: int = 3, spaces: Spaces = SPACES) -> Transitions:
 
 
 def value(critics: TwinCritics, which: int, *parts: Tensor) -> Tensor:
-    """The outputs of a critic of one observation, and of one action if it is continuous, layer by layer."""
+    """The outputs of a critic for one observation, and one action if it is continuous, layer by layer."""
     inputs = torch.cat(parts)
     layers = list(zip(critics.weights, critics.biases, strict=True))
     for index, (weight, bias) in enumerate(layers):
         inputs = inputs @ weight[which] + bias[which, 0]
         if index < len(layers) - 1:
             inputs = inputs.clamp(min=0.0)
-    return inputs if len(parts) == 1 else inputs[0]
+    return inputs
 
 
 def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,11 +102,19 @@ def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Te
     return action, squashed.log_prob(action).sum()
 
 
-def check(built: Built, gradients: dict[str, Tensor], terms: list[Tensor], losses: list[Tensor], target: float) -> None:
-    """Compare gradients and terms with the losses of the critics and of the policy, and with the entropy."""
+def check(
+    built: Built,
+    gradients: dict[str, Tensor],
+    terms: list[Tensor],
+    losses: list[Tensor],
+    target: float,
+    quantiles: Tensor | None = None,
+) -> None:
+    """Compare gradients and terms with the losses of the critics (of their values and of their quantiles) and of the
+    policy, and with the entropy."""
     value_loss, policy_loss, entropy = losses
     for name, loss, parameters in (
-        ("critics", value_loss, list(built.critics.parameters())),
+        ("critics", value_loss if quantiles is None else quantiles, list(built.critics.parameters())),
         ("policy", policy_loss, built.network.learned_parameters()),
     ):
         expected = torch.cat([each.flatten() for each in torch.autograd.grad(loss, parameters)])
@@ -123,20 +131,38 @@ def test_gradients_are_those_of_the_papers_losses() -> None:
     torch.manual_seed(5)
     gradients, terms = built.sac.gradients(batch)
     alpha, targets = 0.3, built.targets
-    value_loss, policy_loss, entropy = torch.zeros(()), torch.zeros(()), torch.zeros(())
+    value_loss, loss, policy_loss, entropy = (torch.zeros(()) for _ in range(4))
     for row in range(ROWS):
         now, then = batch.observations["o"][row], batch.next_observations["o"][row]
         with torch.no_grad():
             action, log_prob = chosen(built.network, then, noise[ROWS + row])
-            smaller = min(value(targets, which, then, action) for which in range(2))
-            y = batch.rewards[row] + batch.discounts[row] * (smaller - alpha * log_prob)
+            pooled = sorted(float(each) for which in range(2) for each in value(targets, which, then, action))
+            kept = torch.tensor(pooled[: 2 * QUANTILES - DROPPED])
+            y = batch.rewards[row] + batch.discounts[row] * (kept - alpha * log_prob)
         for which in range(2):
-            value_loss = value_loss + 0.5 * (value(built.critics, which, now, batch.actions[row]) - y) ** 2 / ROWS
+            quantiles = value(built.critics, which, now, batch.actions[row])
+            value_loss = value_loss + 0.5 * (quantiles.mean() - y.mean()) ** 2 / ROWS
+            for number, quantile in enumerate(quantiles):
+                level, errors = (number + 0.5) / QUANTILES, y - quantile
+                weights = torch.where(errors < 0.0, 1.0 - level, level)
+                hubers = functional.huber_loss(quantile.expand_as(y), y, reduction="none")
+                loss = loss + (weights * hubers).mean() / (ROWS * QUANTILES)
         action, log_prob = chosen(built.network, now, noise[row])
-        smaller = torch.minimum(value(built.critics, 0, now, action), value(built.critics, 1, now, action))
-        policy_loss = policy_loss + (alpha * log_prob - smaller) / ROWS
+        mean = torch.cat([value(built.critics, which, now, action) for which in range(2)]).mean()
+        policy_loss = policy_loss + (alpha * log_prob - mean) / ROWS
         entropy = entropy - log_prob.detach() / ROWS
-    check(built, gradients, terms, [value_loss, policy_loss, entropy], -3.0)
+    check(built, gradients, terms, [value_loss, policy_loss, entropy], -3.0, loss)
+
+
+def test_quantile_loss_by_hand() -> None:
+    """Levels 1/4 and 3/4 at 0.5 and 4, targets 0 and 3: the slopes are (3/4 * 0.5 - 1/4 * 1) / 2 and 1/4 * (1 + 1) / 2.
+
+    They are divided by the two quantiles.
+    """
+    values = torch.tensor([[[0.5, 4.0]], [[0.0, 0.0]]], requires_grad=True)
+    quantile_loss(values, torch.tensor([[0.0, 3.0]])).backward()
+    assert values.grad is not None
+    torch.testing.assert_close(values.grad[0, 0], torch.tensor([0.03125, 0.125]))
 
 
 def test_gradients_of_a_choice_are_those_of_the_papers_losses() -> None:
@@ -189,7 +215,10 @@ def test_temperature_of_a_choice_rises_where_the_policy_is_nearly_certain(logit:
 
 
 def test_target_by_hand() -> None:
-    """Policy N(0, 1) before tanh, Q- = 2 and 5, Q = 1 and 4: y = r + d (2 - alpha log pi(a' | s'))."""
+    """Policy N(0, 1) before tanh, quantiles 2 and 5 of the target critics, 1 and 4 of the critics.
+
+    Four of 25 quantiles 5 are dropped: the mean of y is r + d ((25 * 2 + 21 * 5) / 46 - alpha log pi(a' | s')).
+    """
     built = Built()
     for parameter in built.network.parameters():
         parameter.data.zero_()
@@ -198,14 +227,14 @@ def test_target_by_hand() -> None:
         (built.sac.learned["critics"], (1.0, 4.0)),
     ):
         which.zero_()
-        which[-2:] = torch.tensor(values)  # the biases of the last layer
+        which[-2 * QUANTILES :] = torch.tensor(values).repeat_interleave(QUANTILES)  # the biases of the last layer
     batch = transitions()._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
     torch.manual_seed(5)
     u = torch.randn(2 * ROWS, 3)[ROWS:].double()
     torch.manual_seed(5)
     _, (_, value_loss, *_) = built.sac.gradients(batch)
     log_prob = (-0.5 * u**2 - 0.5 * math.log(2.0 * math.pi) - torch.log(1.0 - torch.tanh(u) ** 2)).sum(-1)
-    y = 0.5 + 0.9 * (2.0 - 0.3 * log_prob)
+    y = 0.5 + 0.9 * ((25 * 2.0 + 21 * 5.0) / 46 - 0.3 * log_prob)
     assert float(value_loss) == pytest.approx(float((0.5 * ((1.0 - y) ** 2 + (4.0 - y) ** 2)).mean()), rel=1e-4)
 
 
