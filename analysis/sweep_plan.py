@@ -14,6 +14,7 @@ from daedalus.learner.run.settings import SettingsError, read_value
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import RunSpec
 
+_PACKAGE = "environment.package"
 _LOG_FACTOR = 10.0  # a range that spans more is sampled on a logarithmic scale
 _DIGITS = r"\d+(?:_\d+)*"
 _NUMBER = rf"[+-]?(?:{_DIGITS}\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -217,6 +218,8 @@ def _check_same(run: PlannedRun) -> None:
     if not has_begun(run):
         return
     before, now = (_flat(spec) for spec in (run_directory.read_config(run.directory), run.spec))
+    if now[_PACKAGE] is None:  # then the run has the one that was installed when it began
+        now[_PACKAGE] = before.get(_PACKAGE)
     different = [key for key in now if before.get(key) != now[key]]
     if different:
         key = different[0]

@@ -1,6 +1,7 @@
 """Test of analysis/sweep_plan.py."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -182,3 +183,13 @@ def test_a_run_that_was_begun_with_other_settings_is_refused(tmp_path: Path) -> 
         f"{run.directory} was begun with other settings (training.env_steps is 1500000, and not 7000): "
         "choose another --folder, or remove this one"
     )
+
+
+def test_a_run_that_has_recorded_the_package_of_its_environment_has_the_same_settings(tmp_path: Path) -> None:
+    (run,) = planner(tmp_path).runs("", {}, [1])
+    environment = run.spec.environment.model_copy(update={"package": "gymnasium==1.0"})
+    finish(replace(run, spec=run.spec.model_copy(update={"environment": environment})))
+    (again,) = planner(tmp_path).runs("", {}, [1])
+    assert is_done(again)
+    with pytest.raises(SettingsError, match=r"environment\.package is gymnasium==1\.0, and not gymnasium==2\.0"):
+        planner(tmp_path).runs("", {"environment.package": "gymnasium==2.0"}, [1])
