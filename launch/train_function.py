@@ -287,7 +287,7 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
             return run_locally(run, threading.Event(), output, output.unlimited_pipes)
     except RunFailedError as error:
         failure = error
-    if not (output.withheld or isinstance(failure, UnsavedError)):
+    if not (run.resume or output.withheld or isinstance(failure, UnsavedError)):
         run_directory.remove_failed(run.directory)
     # A restarted process fails with the same message.
     reasons = dict.fromkeys([*errors, *str(failure).splitlines()])

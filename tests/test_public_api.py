@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import gymnasium
 import numpy as np
@@ -29,10 +29,13 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.cli.commands.evaluate import main as evaluate_command
+from daedalus.launch import train_function
+from daedalus.launch.local_run import LocalRun, RunFailedError
+from daedalus.learner.run.run_directory import create
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.saved_policy import find_policy, pretrained
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 BUDGET = {"env_steps": 5_000, "actors": 1, "settings": {"evaluation.final_episodes": 0, "policy.hidden": [16]}}
 
@@ -119,6 +122,20 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
     assert lines[0].startswith("unknown environment 'CartPole-v9'")
     assert len(lines) == len(set(lines))
     assert not (tmp_path / "run").exists()
+
+
+def test_a_resumed_run_that_fails_keeps_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> NoReturn:
+        raise RunFailedError("no GPU")
+
+    monkeypatch.setattr(train_function, "run_locally", fail)
+    spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}})
+    for resumed in (True, False):
+        directory = tmp_path / str(resumed)
+        create(directory, spec)
+        with pytest.raises(daedalus.TrainingError, match="no GPU"):
+            train_function._run(LocalRun(directory=directory, spec=spec, started=0.0, resume=resumed), True)
+        assert directory.exists() == resumed
 
 
 @pytest.mark.parametrize(
