@@ -113,7 +113,7 @@ class _Lesson:
             return
         state.returns.append(episode_return)
         state.episodes += 1
-        if len(state.returns) > self._episodes:
+        while len(state.returns) > self._episodes:  # also after a resume with a smaller number
             state.returns.popleft()
         # Not after each episode, so that an episode costs the same however many are compared.
         if len(state.returns) < self._episodes or state.episodes % max(self._episodes // 20, 1):

@@ -85,6 +85,10 @@ def test_the_mean_of_many_returns_is_looked_at_after_each_twentieth_of_them() ->
     resumed = LessonProgress(run, {NAME: LessonState.model_validate(lessons.states()[NAME])})
     resumed.add([episodes((1.0, 1.0))], 2)
     assert drawn(resumed) == [(5.0, 5.0, 1.0)]
+    fewer = run.model_copy(update={"training": run.training.model_copy(update={"target_episodes": 2})})
+    resumed = LessonProgress(fewer, {NAME: LessonState.model_validate(lessons.states()[NAME])})
+    resumed.add([episodes((1.0, 0.0))], 2)
+    assert drawn(resumed) == [(1.0, 1.0, 1.0)]  # the newest two have 0.5
 
 
 def test_a_run_may_resume_with_and_without_a_lesson() -> None:
