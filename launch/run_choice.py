@@ -228,13 +228,13 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
         spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
     if problem := unmeasured_target(spec):
         raise SettingsError(problem)
-    warn_of_unread(choice.names(), spec)
+    warn_of_unread(choice.names(), spec, spaces)
     return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
 
 
-def warn_of_unread(chosen: set[str], spec: RunSpec) -> None:
-    """Log which settings that a user chose have no effect in the run."""
-    if unread := sorted(chosen & unread_settings(spec)):
+def warn_of_unread(chosen: set[str], spec: RunSpec, spaces: Spaces | None = None) -> None:
+    """Log which settings that a user chose have no effect in the run. `spaces` are those of the run, if known."""
+    if unread := sorted(chosen & unread_settings(spec, spaces)):
         _logger.warning("no effect in this run (algorithm %s): %s", spec.training.algorithm, ", ".join(unread))
 
 

@@ -18,8 +18,9 @@ from pydantic import JsonValue, ValidationError
 
 from daedalus.learner.run.run_files import RunDataError, read_toml
 from daedalus.learner.run.setting_errors import ambiguous, known_names, one_line, unknown_setting
+from daedalus.policy.component_inputs import encoded_spaces, normalized_components
 from daedalus.protocol.algorithms import check_algorithm, is_own
-from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.texts import exact_number, without_secrets
 
@@ -289,15 +290,25 @@ def changed_settings(settings: Mapping[str, Any]) -> list[str]:
     return [path for path, value in settings.items() if path not in defaults or value != defaults[path]]
 
 
-def unread_settings(spec: RunSpec) -> set[str]:
-    """Return the settings of `policy` and `training` that nothing reads in a run with these others."""
+_OF_GAUSSIANS = {  # distributions that read a setting
+    "policy.initial_std": ("gaussian", "squashed_gaussian", "gaussian_mixture"),
+    "policy.state_dependent_std": ("gaussian", "squashed_gaussian"),
+    "policy.mixture_components": ("gaussian_mixture",),
+}
+
+
+def unread_settings(spec: RunSpec, spaces: Spaces | None = None) -> set[str]:
+    """Return the settings of `policy`, `training` and `league` that nothing reads in a run with these others.
+
+    `spaces` are those of the run, if they are known.
+    """
     policy, training, record = spec.policy, spec.training, spec.algorithm
     if is_own(training.algorithm):
         return set()  # which may read any
     has_returns = record.heads == "policy_and_value"
     unread = {
-        "training.passes training.minibatches training.clip_range training.surrogate "
-        "training.proximal_policy": record.passes_over_batch,
+        "training.passes training.minibatches training.clip_range training.surrogate": record.passes_over_batch,
+        "training.proximal_policy": record.passes_over_batch and not training.explores,
         "training.trace_lambda": not record.replay and not training.algorithm.startswith("one_step"),
         "training.rho_clip": record.corrected or (has_returns and training.explores),
         "training.trace_clip": record.corrected,
@@ -310,22 +321,50 @@ def unread_settings(spec: RunSpec) -> set[str]:
         "training.demonstration_share": record.replay,
         "training.cloning_updates training.cloning_weight": record.demonstrations and not record.replay,
         "training.rmsprop_decay": training.optimizer == "rmsprop",
+        "training.exploration_env_steps": training.explores,
+        "training.max_policy_lag": not record.synchronous,
         "policy.separate_value_encoder": has_returns and policy.memory == "none",
         "policy.memory_units": policy.memory != "none",
-        "policy.mixture_components": policy.distribution == "gaussian_mixture",
+        **{name: policy.distribution in readers for name, readers in _OF_GAUSSIANS.items()},
+        "league.target_win_rate": spec.league.target_opponent is not None,
     }
-    return {name for names, is_read in unread.items() if not is_read for name in names.split()}
+    found = {name for names, is_read in unread.items() if not is_read for name in names.split()}
+    return found if spaces is None else found | _unread_with(spec, spaces)
+
+
+def _unread_with(spec: RunSpec, spaces: Spaces) -> set[str]:
+    """Return the settings of `policy` that nothing reads with these spaces."""
+    policy, replay, found = spec.policy, spec.algorithm.replay, set[str]()
+    if not (replay or any(isinstance(space, ContinuousSpace) for space in spaces.actions.values())):
+        found |= {"policy.distribution", *_OF_GAUSSIANS}
+    encoded = encoded_spaces(policy, spaces.observations)
+    others = [each for each in encoded.values() if not (isinstance(each, ArraySpace) and each.is_image)]
+    by_images = len(encoded) == 1 and policy.encoder != "auto"  # an array of any shape is read as an image
+    if not (replay or policy.encoder in ("mlp", "grid") or is_own(policy.encoder)):
+        found |= {"policy.hidden", "policy.activation"} if by_images or not others else set()
+    normalizing = policy.model_copy(update={"normalize_observations": True})
+    if not normalized_components(normalizing, spaces.observations):
+        found.add("policy.normalize_observations")
+    return found
 
 
 def unmeasured_target(spec: RunSpec) -> str:
-    """Return why a run without evaluations cannot reach its target, or an empty string."""
+    """Return why nothing in a run can show that its target is reached, or an empty string."""
     true_task, target = spec.trains_true_task, spec.training.target_return
-    if true_task or target is None or spec.evaluation.seconds is not None:
+    if target is not None and not true_task and spec.evaluation.seconds is None:
+        return (
+            f"training.target_return is {target:g}, but training plays another task (environment.training_kwargs, "
+            "environment.no_reward_limit or lessons), whose returns say nothing about the target: set "
+            "evaluation.seconds, such as 30, or training.target_return=none"
+        )
+    league = spec.league
+    opponent, shares = league.target_opponent, league.opponents
+    of_training = league.past + sum(shares.values()) if opponent is None else shares[opponent]
+    counts = league.rating_share > 0.0 or (league.rating_actions == "sampled" and of_training > 0.0)
+    if counts or (opponent is None and league.target_rating is None):
         return ""
-    return (
-        f"training.target_return is {target:g}, but training plays another task (environment.training_kwargs, "
-        "environment.no_reward_limit or lessons), whose returns say nothing about the target: set evaluation.seconds, "
-        "such as 30, or training.target_return=none"
+    return f"the target is {spec.target}, but no match counts for it: set league.rating_share above 0, such as 0.01" + (
+        ", or a share of the matches in league.opponents" if league.rating_actions == "sampled" else ""
     )
 
 

@@ -19,12 +19,21 @@ from daedalus.learner.run.settings import (
     read_preset,
     read_settings,
     run_spec,
+    unmeasured_target,
     unread_settings,
 )
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.messages import Welcome
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+
+IMAGE, CELLS = ArraySpace(shape=(84, 84, 3), dtype="uint8"), ArraySpace(shape=(7, 7, 3), dtype="uint8")
+NUMBERS = ArraySpace(shape=(4,), dtype="float32")
+DISCRETE = {"action": DiscreteSpace(counts=(2,))}
+CONTINUOUS = {"action": ContinuousSpace(low=(-1.0,), high=(1.0,))}
+OF_LAYERS = "policy.hidden policy.activation"
+OF_DISTRIBUTIONS = "policy.distribution policy.initial_std policy.state_dependent_std policy.mixture_components"
 
 
 def settings(*assignments: str, **sections: Any) -> dict[str, Any]:
@@ -409,7 +418,26 @@ def test_sac_replaces_the_settings_of_another_algorithm_and_keeps_its_own() -> N
     [
         ({}, "training.passes training.trace_clip policy.memory_units training.n_step", "training.trace_lambda"),
         ({"training": {"algorithm": "appo"}}, "training.rho_clip training.target_rate", "training.passes"),
-        ({"training": {"algorithm": "appo", "exploration": [0.1]}}, "training.trace_clip", "training.rho_clip"),
+        (
+            {"training": {"algorithm": "appo", "exploration": [0.1]}},
+            "training.trace_clip training.proximal_policy",
+            "training.rho_clip training.exploration_env_steps",
+        ),
+        ({"training": {"algorithm": "a2c"}}, "training.max_policy_lag training.exploration_env_steps", ""),
+        (
+            {"policy": {"distribution": "kumaraswamy"}},
+            "policy.initial_std policy.state_dependent_std league.target_win_rate",
+            "policy.distribution policy.hidden training.max_policy_lag",
+        ),
+        (
+            {
+                "environment": {"id": "a:b", "backend": "pettingzoo"},
+                "league": {"target_opponent": "random"},
+                "policy": {"distribution": "gaussian_mixture"},
+            },
+            "policy.state_dependent_std",
+            "policy.initial_std policy.mixture_components league.target_win_rate",
+        ),
         ({"training": {"algorithm": "one_step_q"}}, "training.trace_lambda", "training.target_period"),
         ({"training": {"optimizer": "rmsprop"}}, "policy.mixture_components", "training.rmsprop_decay"),
         ({"policy": {"memory": "gru"}}, "policy.separate_value_encoder", "policy.memory_units"),
@@ -433,6 +461,53 @@ def test_settings_that_nothing_reads_are_known(settings: dict[str, Any], unread:
     for name in found:  # all exist
         section, key = name.split(".")
         assert hasattr(getattr(made, section), key)
+
+
+@pytest.mark.parametrize(
+    ("settings", "observations", "actions", "unread"),
+    [
+        ({}, (IMAGE,), DISCRETE, f"{OF_DISTRIBUTIONS} {OF_LAYERS} policy.normalize_observations"),
+        ({}, (IMAGE, NUMBERS), CONTINUOUS, ""),
+        ({"encoder": "mlp"}, (IMAGE,), CONTINUOUS, ""),
+        ({"encoder": "own:Encoder"}, (NUMBERS,), DISCRETE, OF_DISTRIBUTIONS),
+        ({"encoder": "small"}, (NUMBERS,), CONTINUOUS, OF_LAYERS),
+        ({"codes": {"0": [3]}}, (CELLS,), CONTINUOUS, "policy.normalize_observations"),
+    ],
+)
+def test_settings_of_a_network_that_nothing_reads_depend_on_the_spaces(
+    settings: dict[str, Any], observations: tuple[ArraySpace, ...], actions: Any, unread: str
+) -> None:
+    made = run_spec({"environment": {"id": "A-v0"}, "policy": settings})
+    spaces = Spaces(observations={str(number): each for number, each in enumerate(observations)}, actions=actions)
+    assert unread_settings(made, spaces) == unread_settings(made) | {*unread.split()}
+
+
+@pytest.mark.parametrize(
+    ("league", "is_measured"),
+    [
+        ({}, True),
+        ({"rating_share": 0.0}, True),
+        ({"target_opponent": "random"}, True),
+        ({"target_opponent": "random", "rating_share": 0.0}, False),
+        ({"target_opponent": "random", "rating_share": 0.0, "opponents": {"random": 0.1}}, True),
+        (
+            {
+                "target_opponent": "random",
+                "rating_share": 0.0,
+                "opponents": {"random": 0.1},
+                "rating_actions": "greedy",
+            },
+            False,
+        ),
+        ({"target_rating": 100.0, "rating_share": 0.0}, True),
+        ({"target_rating": 100.0, "rating_share": 0.0, "past_share": 0.0}, False),
+    ],
+)
+def test_a_target_for_which_no_match_counts_is_refused(league: dict[str, Any], is_measured: bool) -> None:
+    made = run_spec({"environment": {"id": "a:b", "backend": "pettingzoo"}, "league": league})
+    problem = unmeasured_target(made)
+    assert (problem == "") == is_measured
+    assert is_measured or "no match counts for it: set league.rating_share above 0" in problem
 
 
 def test_settings_of_the_user_that_nothing_reads_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
