@@ -273,6 +273,7 @@ class LearnerProcess:
         spaces = options.spaces
         if restored is None and options.prepared is None:
             run, spaces = self._with_spaces(run)
+            self._progress.updates_per_batch = run.spec.training.updates_per_batch
         weights = options.new.init_from or (initial_to_resume(run.directory) if resumed else None)
         initial = find_policy(weights) if weights is not None and restored is None else None
         transport = options.network.open(run.spec, self._credentials, self._stop)

@@ -24,7 +24,8 @@ class Progress:
 
     def __init__(self, stream: TextIO, env_steps_budget: int, updates_per_batch: int = 1) -> None:
         self._stream = stream
-        self._budget, self._updates_per_batch = env_steps_budget, updates_per_batch
+        self._budget = env_steps_budget
+        self.updates_per_batch = updates_per_batch  # by which a policy lag in updates is one in batches
         self._terminal = is_terminal(stream)
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
         self._rewriting = False
@@ -38,7 +39,7 @@ class Progress:
             if time.monotonic() < self._next_line:
                 return
             self._next_line = time.monotonic() + _LINE_SECONDS
-        parts = _parts(row, self._budget, self._updates_per_batch)
+        parts = _parts(row, self._budget, self.updates_per_batch)
         parts = [parts[0], waits_for, parts[-1]] if waits_for else parts
         if self._terminal:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line

@@ -1,5 +1,7 @@
 """Test of cli/settings_arguments.py: what a command line makes of the settings."""
 
+import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -7,9 +9,13 @@ import pytest
 from daedalus.cli.commands.learner import learner_options, parser
 from daedalus.cli.commands.train import resume_parser, train_parser
 from daedalus.cli.settings_arguments import run_choice
-from daedalus.launch.learner_process import ChosenRun, choose_run
+from daedalus.launch import learner_process
+from daedalus.launch.learner_process import ChosenRun, LearnerNetwork, LearnerProcess, choose_run
+from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
 
@@ -133,3 +139,19 @@ def test_a_learner_that_resumes_changes_the_settings_that_its_command_line_names
     ):
         with pytest.raises(SettingsError, match=rf"^the run in .*/run has other settings \({names}\): leave out"):
             resumed(*words)
+
+
+def test_a_learner_shows_the_lag_in_batches_of_the_settings_for_its_spaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = Spaces(
+        observations={"observation": ArraySpace(shape=(64, 64, 3), dtype="uint8")},
+        actions={"action": DiscreteSpace(counts=(2,))},
+    )
+    monkeypatch.setattr(learner_process, "expected_defaults", lambda *_: (image, default_settings(image)))
+    monkeypatch.setattr(learner_process, "expected_spaces", lambda *_: image)
+    monkeypatch.setattr(LearnerNetwork, "open", lambda *_: None)  # stopped while no router answered
+    options = learner_options(parser().parse_args(["--env", "CartPole-v1"]), 0.0, Path())
+    process = LearnerProcess(options, threading.Event(), UserMetrics())
+    before = process._progress.updates_per_batch
+    with ExitStack() as stack:
+        process._serve(process._run, stack)
+    assert (before, process._progress.updates_per_batch) == (10 * 16, 4 * 16)
