@@ -10,6 +10,7 @@ from typing import Any
 
 from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.setting_errors import types_of
 from daedalus.learner.run.settings import SettingsError, read_value
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import RunSpec
@@ -35,7 +36,7 @@ class Range:
     key: str
     low: float
     high: float
-    whole: bool  # whether the setting is an integer
+    whole: bool  # whether its values are integers
 
     @property
     def log(self) -> bool:
@@ -72,7 +73,8 @@ def read_axis(text: str) -> Axis:
             raise SettingsError(f"--over {text}: an end of the range is too large")
         if not low < high:
             raise SettingsError(f"--over {text}: the range is empty: write the lower end first")
-        whole = all(re.fullmatch(rf"[+-]?{_DIGITS}", end) for end in ends.groups())
+        whole = float not in types_of(key.split("."))  # an argument of an environment has any type
+        whole = whole and all(re.fullmatch(rf"[+-]?{_DIGITS}", end) for end in ends.groups())
         return Range(key=key, low=low, high=high, whole=whole)
     values = split_values(rest)
     if "" in values:

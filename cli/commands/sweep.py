@@ -38,8 +38,9 @@ examples:
   daedalus sweep cartpole --over training.learning_rate=1e-4..1e-2 --sampler --trials 30 --seeds 3
 
 A setting with LOW..HIGH is a range of numbers, for --sampler; it is searched on a logarithmic scale if it spans more
-than a factor of 10. With --sampler, Optuna chooses the values by the results so far. It ranks runs that stop at a
-target return by their env_steps, and others by their final return.
+than a factor of 10. For an argument of the environment, its numbers are whole if both ends are. With --sampler, Optuna
+chooses the values by the results so far. It ranks runs that stop at a target return by their env_steps, and others by
+their final return.
 
 exit status: 0 all runs have ended, 1 a run failed or the sweep was stopped, 2 bad usage"""
 

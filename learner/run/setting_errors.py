@@ -57,7 +57,7 @@ def ambiguous(path: list[str], value: Any) -> str:
 
     It takes true for the number 1, and a set, which has no order, for a list.
     """
-    kinds = _types(path)
+    kinds = types_of(path)
     if isinstance(value, set | frozenset):
         return f"{value!r}, which has no order: write a list"
     if isinstance(value, list | tuple):
@@ -82,7 +82,7 @@ def _path(location: tuple[int | str, ...]) -> list[str]:
     for part in location:
         if not is_member:
             path.append(str(part))
-        is_member = not is_member and len(_types(path)) > 1
+        is_member = not is_member and len(types_of(path)) > 1
     return path
 
 
@@ -113,7 +113,7 @@ def _as_list(path: list[str], value: Any) -> str:
 
 def _element(path: list[str]) -> Any:
     """Return the type of the elements of a setting that is a list; None if there is no such setting."""
-    for kind in _types(path):
+    for kind in types_of(path):
         if get_origin(kind) is tuple:
             return _bare(get_args(kind)[0])
     return None
@@ -121,7 +121,7 @@ def _element(path: list[str]) -> Any:
 
 def _fixed_length(path: list[str]) -> int:
     """Return the length of the list that a setting is, or 0 if it is no list or its length is not fixed."""
-    kinds = _types(path)
+    kinds = types_of(path)
     if len(kinds) != 1 or get_origin(kinds[0]) is not tuple or ... in get_args(kinds[0]):
         return 0
     return len(get_args(kinds[0]))
@@ -163,7 +163,7 @@ def _field(path: list[str]) -> FieldInfo | None:
     return model.model_fields.get(path[-1]) if model else None
 
 
-def _types(path: list[str]) -> list[Any]:
+def types_of(path: list[str]) -> list[Any]:
     """Return the types that a setting may have besides None; empty if there is no such setting."""
     field = _field(path)
     if field is None:

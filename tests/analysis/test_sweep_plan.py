@@ -51,7 +51,10 @@ def test_a_list_of_values() -> None:
         ("collection.rollout_length=4..64", 4, 64, True, True),
         ("collection.rollout_length=4..40", 4, 40, True, False),
         ("training.entropy_bonus=0.0..0.1", 0.0, 0.1, False, False),
-        ("training.entropy_bonus=-1..1", -1, 1, True, False),
+        ("environment.kwargs.size=-1..1", -1, 1, True, False),
+        ("environment.kwargs.size=-1..1.0", -1, 1, False, False),
+        ("training.entropy_bonus=0..1", 0, 1, False, False),
+        ("training.target_return=0..1", 0, 1, False, False),
     ],
 )
 def test_a_range_is_logarithmic_beyond_a_factor_of_10(
