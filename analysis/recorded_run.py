@@ -95,15 +95,19 @@ class RecordedRun:
         done = self.metrics[ENV_STEPS][-1]
         budget = self.settings.get("training.env_steps", math.nan)
         ended = self.summary.get("finished") or self.evaluation_return is not None
-        # A run that was resumed with a larger budget has made more steps than its summary says.
-        steps = self.summary.get("env_steps")
-        if ended and (steps is None or done <= steps):
+        if ended and not self.has_gone_on:
             return ""
         running = is_locked(self.directory)
         remedy = "it is still running" if running else f"continue it with: {self.resume_command}"
         author = self.summary.get("stopped_by")
         stopped = f", stopped by {bounded_text(author)}" if isinstance(author, str) and not running else ""
         return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps){stopped}: {remedy}"
+
+    @property
+    def has_gone_on(self) -> bool:
+        """Whether the run was resumed and has made more steps than its summary says."""
+        steps = self.summary.get("env_steps")
+        return steps is not None and bool(self.metrics[ENV_STEPS][-1] > steps)
 
     @property
     def was_stopped(self) -> bool:
@@ -404,29 +408,32 @@ class RunRecord(RecordedRun):
     @property
     def bottleneck(self) -> str:
         """What the run waited for, in one line; empty if it is not known."""
-        text = self.summary.get("bottleneck")
+        text = None if self.has_gone_on else self.summary.get("bottleneck")
         return bounded_text(text) if isinstance(text, str) else ""
 
     @property
     def league(self) -> LeagueStatus | None:
         """Ratings and results of a game with opponents at the end of training; None without any that can be read."""
         try:
-            return LeagueStatus.model_validate(self.summary.get("league")).bounded()
+            return LeagueStatus.model_validate(None if self.has_gone_on else self.summary.get("league")).bounded()
         except ValidationError:
             return None
 
     @property
     def rejected(self) -> dict[str, int]:
         """Rejected rollouts of a run that has a summary, by cause."""
-        causes = self.summary.get("rollouts_rejected")
+        causes = None if self.has_gone_on else self.summary.get("rollouts_rejected")
         if not isinstance(causes, dict):
             return {}
         return {cause: count for cause, count in causes.items() if isinstance(count, int) and count > 0}
 
     def number(self, name: str) -> float | None:
-        """Return a finite number of summary.json, or else the last one of the column of metrics.csv, or None."""
+        """Return a finite number of summary.json, or else the last one of the column of metrics.csv, or None.
+
+        The summary of a run that has gone on since is out of date.
+        """
         value = finite(self.summary.get(name))
-        if value is not None or name not in self.metrics:
+        if name not in self.metrics or (value is not None and not self.has_gone_on):
             return value
         column = self.metrics[name]
         known = column[np.isfinite(column)]

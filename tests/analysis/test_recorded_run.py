@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from recorded_runs import TARGET, record
 
-from daedalus.analysis.recorded_run import SECONDS, read_run
+from daedalus.analysis.recorded_run import SECONDS, read_record, read_run
 from daedalus.analysis.run_selection import find_runs
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
 from daedalus.learner.run.run_files import RunDataError
@@ -86,8 +86,12 @@ class TestUnfinished:
     def test_a_run_that_was_resumed_since_its_summary_is(self, tmp_path: Path) -> None:
         directory = record(tmp_path / "run")
         summary = json.loads((directory / SUMMARY).read_text())
-        (directory / SUMMARY).write_text(json.dumps({**summary, "env_steps": 2000}))
-        assert "is not finished" in read_run(directory).unfinished
+        before = {"env_steps": 2000, "wall_seconds": 120.0, "bottleneck": "none", "rollouts_rejected": {"stale": 3}}
+        (directory / SUMMARY).write_text(json.dumps({**summary, **before}))
+        run = read_record(directory)
+        assert "is not finished" in run.unfinished
+        assert (run.number("env_steps"), run.number("wall_seconds")) == (3000.0, 180.0)
+        assert (run.bottleneck, run.rejected, run.league) == ("", {}, None)
 
 
 class TestBadInput:
