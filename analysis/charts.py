@@ -58,8 +58,10 @@ def draw_curves(groups: Sequence[Group], output: Path, by: str) -> None:
     lines = math.ceil(len(plotted) / 2)
     figure = _figure(11, 3.5 * lines)
     axes = figure.subplots(lines, 2, sharex=True)
-    several = any(len(group.runs) > 1 for group in groups)
-    band = "band: 95 % interval of the runs" if several else "band: one std; circles: evaluations"
+    several, alone = (any((len(group.runs) > 1) == each for group in groups) for each in (True, False))
+    band = "band: one std; circles: evaluations" if alone else ""
+    if several:
+        band = f"band: 95 % interval of the runs{'; of one run ' if alone else ''}{band.removeprefix('band: ')}"
     if len(training_tasks(groups)) > 1:
         band += "; different tasks in training"
     for axis, (column, title) in zip(axes.flat, plotted.items(), strict=False):
@@ -107,7 +109,8 @@ def draw_profiles(groups: Sequence[Group], output: Path) -> None:
     for index, (group, scores) in enumerate(zip(groups, returns, strict=True)):
         low, high = profile_interval([scores], thresholds)
         shares = performance_profile([scores], thresholds)
-        _draw(axis, Series(name=group.name, x=thresholds, y=shares, low=low, high=high), f"C{index}", _label(group))
+        label = _label(group) + (": no episode of a run has ended" if np.isnan(scores).any() else "")
+        _draw(axis, Series(name=group.name, x=thresholds, y=shares, low=low, high=high), f"C{index}", label)
     axis.ticklabel_format(useOffset=False)
     axis.set_xlabel("return")
     axis.set_ylabel("share of runs with a higher final return")

@@ -88,7 +88,7 @@ def performance_profile(strata: Strata, thresholds: np.ndarray) -> np.ndarray:
     Agarwal et al. (2021), section 4.2.
 
     Args:
-      strata: the scores, [runs of the task] for each task.
+      strata: the scores, [runs of the task] for each task; the profile with one that is unknown (NaN) is unknown.
       thresholds: [thresholds].
 
     Returns: [thresholds].
@@ -103,8 +103,12 @@ def profile_interval(strata: Strata, thresholds: np.ndarray, *, seed: int = 0) -
 
 def _shares_above(samples: Strata, thresholds: np.ndarray) -> np.ndarray:
     """Return [repetitions, thresholds] from strata [repetitions, runs of the task]."""
-    tasks = [(scores[:, :, None] > thresholds).mean(1) for scores in samples]
+    tasks = [_above(scores[:, :, None], thresholds).mean(1) for scores in samples]
     return np.mean(tasks, axis=0)
+
+
+def _above(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    return np.where(np.isnan(scores), np.nan, scores > thresholds)
 
 
 def probability_of_improvement(first: Strata, second: Strata) -> float:

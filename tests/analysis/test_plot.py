@@ -77,6 +77,7 @@ def test_a_curve_is_drawn_for_each_group(tmp_path: Path, monkeypatch: pytest.Mon
         for length in (5, 20):
             settings = [f"collection.rollout_length={length}"]
             record(tmp_path / f"{length}-{seed}", seed=seed, settings=settings, returns=(10.0 * seed,) * 3)
+    record(tmp_path / "one", settings=["collection.rollout_length=30"])
     figures: list[Figure] = []
 
     def savefig(figure: Figure, path: Path, **_options: object) -> None:
@@ -89,7 +90,9 @@ def test_a_curve_is_drawn_for_each_group(tmp_path: Path, monkeypatch: pytest.Mon
     assert [line.get_label() for line in axis.get_lines()] == [
         "rollout_length=5 (3 runs)",
         "rollout_length=20 (3 runs)",
+        "rollout_length=30",
     ]
+    assert axis.get_title().endswith("band: 95 % interval of the runs; of one run one std; circles: evaluations)")
     assert np.all(axis.get_lines()[0].get_ydata() == 20.0)
     (low, high) = axis.collections[0].get_datalim(axis.transData).intervaly
     assert (low, high) == (10.0, 30.0)

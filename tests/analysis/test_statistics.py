@@ -99,6 +99,7 @@ class TestProfile:
         scores = [np.array([1.0, 2.0, 3.0, 4.0]), np.array([2.0, 9.0])]
         profile = performance_profile(scores, np.array([0.0, 2.0, 4.0, 9.0]))
         assert profile.tolist() == [1.0, (0.5 + 0.5) / 2, (0.0 + 0.5) / 2, 0.0]
+        assert np.isnan(performance_profile([np.array([1.0, np.nan])], np.array([0.0]))).all()
 
     def test_it_is_the_share_of_runs_above(self) -> None:
         scores, thresholds = strata(3, 7, 4, 5), np.linspace(-1.0, 7.0, 17)
