@@ -10,7 +10,14 @@ from daedalus.launch.environment_check import checked_spaces
 from daedalus.launch.local_run import LocalRun
 from daedalus.launch.run_choice import RunChoice, check_learner_installed, warn_of_unread, with_record
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.resuming import FinishedRun, finished_run, initial_to_resume, other_spaces, with_changes
+from daedalus.learner.run.resuming import (
+    FinishedRun,
+    finished_run,
+    initial_to_resume,
+    only_at_the_start,
+    other_spaces,
+    with_changes,
+)
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import NoPolicyError, checkpoints, find_policy
@@ -52,7 +59,8 @@ class ResumeChoice:
             settings["training.env_steps"] = self.env_steps
         with Surroundings():  # which an algorithm of the user may change when it is imported
             changed = with_record(with_changes(spec, self.assignments, self.directory, settings), modules)
-        warn_of_unread(RunChoice(assignments=self.assignments, settings=settings).names(), changed)
+        chosen = RunChoice(assignments=self.assignments, settings=settings).names()
+        warn_of_unread(chosen, changed, too=only_at_the_start(self.directory))
         return changed
 
 

@@ -4,6 +4,7 @@ import copy
 import importlib.util
 import logging
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -232,9 +233,14 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
     return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
 
 
-def warn_of_unread(chosen: set[str], spec: RunSpec, spaces: Spaces | None = None) -> None:
-    """Log which settings that a user chose have no effect in the run. `spaces` are those of the run, if known."""
-    if unread := sorted(chosen & unread_settings(spec, spaces)):
+def warn_of_unread(
+    chosen: set[str], spec: RunSpec, spaces: Spaces | None = None, too: AbstractSet[str] = frozenset()
+) -> None:
+    """Log which settings that a user chose have no effect in the run.
+
+    `spaces` are those of the run, if they are known; `too` are further settings that nothing reads.
+    """
+    if unread := sorted(chosen & (unread_settings(spec, spaces) | too)):
         _logger.warning("no effect in this run (algorithm %s): %s", spec.training.algorithm, ", ".join(unread))
 
 

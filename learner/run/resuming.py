@@ -25,7 +25,7 @@ from daedalus.policy.saving.saved_policy import (
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec, TrainingSpec
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -38,6 +38,14 @@ _logger = logging.getLogger(__name__)
 _FIXED_SECTIONS = ("environment.", "policy.")
 _FIXED = {"training.algorithm", "training.optimizer", "training.seed", "training.normalize_rewards", "league.sides"}
 _CHANGEABLE = {"environment.max_episode_steps", "environment.package", "environment.processes"}
+# Settings of `training` that are annealed over the budget, each with the setting of its last value; none: 0.
+_ANNEALED = {
+    "learning_rate": "learning_rate_final",
+    "entropy_bonus": "entropy_bonus_final",
+    "curiosity": "",
+    "cloning_weight": "",
+}
+_AT_THE_START = {"training.cloning_updates", "training.mean_first_value"}  # settings that are read before an update
 
 
 def with_changes(
@@ -80,6 +88,20 @@ def differing(before: RunSpec, after: RunSpec) -> list[str]:
     """Return the settings in which two specifications differ, as `section.key`."""
     old, new = _values(before), _values(after)  # [lessons] has the keys that the user gives it
     return [name for name in {**old, **new} if old.get(name) != new.get(name)]
+
+
+def only_at_the_start(directory: Path) -> set[str]:
+    """Return the settings that nothing reads any more when the run in a directory is resumed."""
+    return _AT_THE_START if checkpoints(directory) else set()
+
+
+def _annealed_before(before: TrainingSpec, training: TrainingSpec) -> list[str]:
+    """Return the settings that changed, and that have no effect once their annealing has ended."""
+    return [
+        f"training.{name}"
+        for name, final in _ANNEALED.items()
+        if getattr(before, name) != getattr(training, name) and (not final or getattr(training, final) is not None)
+    ]
 
 
 def _named(assignments: Sequence[str]) -> list[str]:
@@ -308,6 +330,13 @@ class Beginning:
             if self.reset_statistics:
                 learner.reset_statistics()
                 _logger.info("statistics of observations and rewards reset: the next rollouts define them")
+            if progress >= 1.0 and (unread := _annealed_before(policy.spec.training, spec.training)):
+                _logger.warning(
+                    "no effect: %s; the budget from before was used up, at whose end it has its final value "
+                    "(training.learning_rate_final, training.entropy_bonus_final; else 0): change that, or start a new "
+                    "run from the weights of this one, with --init-from",
+                    ", ".join(unread),
+                )
             if learner.learning_rate(progress) == 0.0:
                 _logger.warning(
                     "the learning rate has been annealed to 0: the policy changes no more; "

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from building import run_spec
 from saved_runs import CARTPOLE, save
 
+from daedalus.launch.resumed_run import ResumeChoice
 from daedalus.learner.run.counters import Annealing, RunCounters
 from daedalus.learner.run.resuming import (
     Beginning,
@@ -20,7 +22,7 @@ from daedalus.learner.run.resuming import (
     other_spaces,
     with_changes,
 )
-from daedalus.learner.run.run_directory import create_locked, write_json
+from daedalus.learner.run.run_directory import create_locked, write_config, write_json
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.saved_policy import FORMAT, SavedPolicy, find_policy
@@ -74,6 +76,17 @@ def test_settings_that_define_what_is_learned_are_refused_by_name(assignment: st
         f"daedalus train runs/one/config.toml --init-from runs/one --set {shlex.quote(assignment)} "
         "--set training.learning_rate=0.5"
     )
+
+
+def test_settings_that_only_a_beginning_reads_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    write_config(run, find_policy(run).spec)
+    choice = ResumeChoice(directory=run, assignments=["training.mean_first_value=true", "training.passes=2"])
+    choice.spec()
+    shutil.rmtree(run / "checkpoints")
+    choice.spec()
+    start = "no effect in this run (algorithm impala): training."
+    assert caplog.messages == [f"{start}mean_first_value, training.passes", f"{start}passes"]
 
 
 def test_a_setting_may_be_repeated_and_a_wrong_one_is_reported() -> None:

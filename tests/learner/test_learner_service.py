@@ -536,9 +536,10 @@ def test_resuming_with_a_learning_rate_of_0_is_reported(tmp_path: Path) -> None:
     settings = annealed(100)
     settings["training"]["learning_rate_final"] = 0.0
     TrainingRun(tmp_path, **settings).finish()
-    settings["training"]["env_steps"] = 200
+    settings["training"] |= {"env_steps": 200, "learning_rate": 0.5, "entropy_bonus": 0.5}  # which has no final value
     TrainingRun(tmp_path, restored=load_newest(tmp_path / "run"), **settings).finish()
     assert sum("the learning rate has been annealed to 0" in line for line in LINES) == 1
+    assert sum("no effect: training.learning_rate; the budget from before" in line for line in LINES) == 1
 
 
 def budget(env_steps: int) -> dict[str, Any]:
