@@ -17,6 +17,7 @@ from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, link_se
 from daedalus.protocol.spec import EnvironmentSpec
 
 _BEST = re.compile(r"best_(training_)?(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)_(\d{10,})", re.ASCII)
+_NAMED_AGENTS = 6  # of a game, for a person
 _KEPT = 3  # of each kind. Scores over few episodes are noisy: with several, the best can be selected over more episodes
 
 
@@ -172,6 +173,9 @@ def evaluation_result(
       returns, lengths: of the episodes, [K] each.
       notes: for a person, such as that episodes were cut.
     """
+    if environment.is_game and environment.agents:
+        named = ", ".join(environment.agents[:_NAMED_AGENTS]) + (", ..." if environment.agents[_NAMED_AGENTS:] else "")
+        notes = [*notes, f"all agents of the game but those of the policy ({named}) take random actions"]
     return {
         "environment": environment.id,
         "backend": environment.backend,

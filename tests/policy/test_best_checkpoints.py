@@ -12,11 +12,13 @@ from daedalus.policy.saving.best_checkpoints import (
     best_checkpoints,
     best_name,
     best_score,
+    evaluation_result,
     keep_if_best,
     rescore,
     set_aside_newer,
 )
 from daedalus.policy.saving.sealed import write_sealed
+from daedalus.protocol.spec import EnvironmentSpec
 
 
 def checkpoint(run: Path, version: int) -> Path:
@@ -137,3 +139,11 @@ def test_leftovers_of_a_crash_are_replaced(tmp_path: Path) -> None:
     (directory.parent / ".best_5.0_0000000001" / "something").mkdir(parents=True)
     assert keep_if_best(directory, 5.0, 1)
     assert scored(tmp_path) == [(5.0, "1")]
+
+
+@pytest.mark.parametrize(("agents", "named"), [((), ""), (("a",), "(a)"), (("a",) * 7, "(a, a, a, a, a, a, ...)")])
+def test_an_evaluation_of_some_agents_of_a_game_says_who_plays_the_others(agents: tuple[str, ...], named: str) -> None:
+    game = EnvironmentSpec(id="m:g", backend="pettingzoo", agents=agents)
+    notes = evaluation_result(Path("1"), 1, game, np.ones(2), np.ones(2), ["cut"])["notes"]
+    others = [f"all agents of the game but those of the policy {named} take random actions"] if agents else []
+    assert notes == ["cut", *others]
