@@ -182,7 +182,7 @@ class _Table:
                 courses[copy].update(self._shown(observed, copy))
             actions = self._actions(players, np.repeat(playing, self._seats))
             if step < self._openings:
-                self._open(observed, actions, random)
+                self._open(observed, actions, random, np.any([player.plays for player in players], axis=0))
             observed, rewards, _, _ = self._environments.step(actions)
             rewards = rewards.reshape(copies, self._seats)[playing]
             refuse_unfit_rewards(rewards.ravel(), np.repeat(records[playing], self._seats))
@@ -210,10 +210,16 @@ class _Table:
                 actions[name] = np.where(player.plays[:, None], own, actions.get(name, own))
         return actions
 
-    def _open(self, observed: Observed, actions: dict[str, np.ndarray], random: Sequence[np.random.Generator]) -> None:
-        """Write random legal actions in all seats that act."""
+    def _open(
+        self,
+        observed: Observed,
+        actions: dict[str, np.ndarray],
+        random: Sequence[np.random.Generator],
+        plays: np.ndarray,
+    ) -> None:
+        """Write random legal actions in all seats that act and that policies play [seats]: bots draw their own."""
         assert observed.acting is not None
-        for row in np.flatnonzero(observed.acting).tolist():
+        for row in np.flatnonzero(observed.acting & plays).tolist():
             masks = {name: mask[[row]] for name, mask in observed.masks.items()}
             for name, values in RandomActions(self._environments.spaces.actions, random[row]).choose(masks).items():
                 actions[name][row] = values[0]

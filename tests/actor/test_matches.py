@@ -98,15 +98,15 @@ def test_outcomes_are_those_of_a_slow_account(
         assert set(scripted_games.PLAYED.values()) == set(range(5))
 
 
-def tic_tac_toe(copies: int, matches: int, **options: Any) -> MatchResults:
-    """Let a policy play against itself."""
+def tic_tac_toe(copies: int, matches: int, bot: type[AlwaysBot] | None = None, **options: Any) -> MatchResults:
+    """Let a policy play against itself, or against a bot."""
     spec = EnvironmentSpec(id="pettingzoo.classic.tictactoe_v3")
     environments = TransformedEnvironment(make_games(spec, copies, MODULES), spec)
     learner = Learner(TrainingSpec(), PolicySpec(hidden=(8,)), environments.spaces)
     runtime = OnnxRuntime(learner.program())
     runtime.load(learner.weights())
     try:
-        return play_matches(environments, ((0,), (1,)), runtime, runtime, matches, 7, **options)
+        return play_matches(environments, ((0,), (1,)), runtime, bot or runtime, matches, 7, **options)
     finally:
         environments.close()
 
@@ -119,8 +119,9 @@ def test_results_do_not_depend_on_the_number_of_copies(sampled: bool, openings: 
     assert one.distinct > 7
 
 
-def test_both_sides_have_the_same_openings() -> None:
-    results = tic_tac_toe(2, 20, sampled=False, openings=3)
+@pytest.mark.parametrize(("bot", "openings"), [(None, 3), (AlwaysBot, 9)])
+def test_both_sides_have_the_same_openings(bot: type[AlwaysBot] | None, openings: int) -> None:
+    results = tic_tac_toe(2, 20, bot, sampled=False, openings=openings)
     as_first, as_second = results.outcomes[:20], results.outcomes[20:]
     assert as_first.tolist() == (2 - as_second).tolist()
     assert results.lengths[:20].tolist() == results.lengths[20:].tolist()
