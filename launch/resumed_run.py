@@ -59,8 +59,8 @@ class ResumeChoice:
             settings["training.env_steps"] = self.env_steps
         with Surroundings():  # which an algorithm of the user may change when it is imported
             changed = with_record(with_changes(spec, self.assignments, self.directory, settings), modules)
-        chosen = RunChoice(assignments=self.assignments, settings=settings).names()
-        warn_of_unread(chosen, changed, too=only_at_the_start(self.directory))
+        chosen = RunChoice(assignments=self.assignments, settings=settings).assigned
+        warn_of_unread(chosen, changed, only_at_the_start(self.directory))
         return changed
 
 

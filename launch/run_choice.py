@@ -87,9 +87,14 @@ class RunChoice:
             )
         return spec
 
+    @property
+    def assigned(self) -> set[str]:
+        """The settings that were chosen by name."""
+        return {*(assignment.partition("=")[0].strip() for assignment in self.assignments), *self.settings}
+
     def names(self) -> set[str]:
         """Return the settings that were chosen; of a file, those that differ from the defaults of this release."""
-        chosen = {*(assignment.partition("=")[0].strip() for assignment in self.assignments), *self.settings}
+        chosen = self.assigned
         if self.preset is not None and self.preset not in preset_names():
             sections = read_preset(self.preset)
             values = {f"{section}.{key}": each for section in sections for key, each in sections[section].items()}
@@ -229,18 +234,14 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
         spaces, spec = transformed_spaces(chosen, spec, spaces, fork=fork), chosen
     if problem := unmeasured_target(spec):
         raise SettingsError(problem)
-    warn_of_unread(choice.names(), spec, spaces)
+    # A file may be the config.toml of another run, with the default settings of its environment.
+    warn_of_unread(choice.names(), spec, unread_settings(spec, spaces) & choice.assigned)
     return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
 
 
-def warn_of_unread(
-    chosen: set[str], spec: RunSpec, spaces: Spaces | None = None, too: AbstractSet[str] = frozenset()
-) -> None:
-    """Log which settings that a user chose have no effect in the run.
-
-    `spaces` are those of the run, if they are known; `too` are further settings that nothing reads.
-    """
-    if unread := sorted(chosen & (unread_settings(spec, spaces) | too)):
+def warn_of_unread(chosen: set[str], spec: RunSpec, too: AbstractSet[str] = frozenset()) -> None:
+    """Log which settings that a user chose have no effect in the run; `too` are further ones that nothing reads."""
+    if unread := sorted(chosen & (unread_settings(spec) | too)):
         _logger.warning("no effect in this run (algorithm %s): %s", spec.training.algorithm, ", ".join(unread))
 
 
