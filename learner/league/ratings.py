@@ -270,11 +270,9 @@ class Ratings:
             rate = self.win_rate(NEWEST, version_name(version)) if prioritized else 0.5
             weights[version_name(version)] = rate * (1.0 - rate)
         total = sum(weights.values())
-        shares = {player: past_share * weight / total for player, weight in weights.items()}
+        shares = {player: _short(past_share * weight / total) for player, weight in weights.items()}
         shares |= {player: share for player, share in fixed.items() if player in self._skills}
-        return tuple(
-            PlannedOpponent(player=player, weight=_short(share)) for player, share in shares.items() if share > 0.0
-        )
+        return tuple(PlannedOpponent(player=player, weight=share) for player, share in shares.items() if share > 0.0)
 
     def rating_plan(self, fixed: Collection[str]) -> tuple[PlannedRating, ...]:
         """Return the matches that only rate, with their probabilities.

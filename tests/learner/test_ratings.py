@@ -108,6 +108,8 @@ def test_prioritized_opponents_are_those_that_win_about_half() -> None:
     assert sum(plan.values()) == pytest.approx(0.4, abs=0.02)
     uniform = {each.player: each.weight for each in ratings.training_plan(0.3, fixed, prioritized=False)}
     assert uniform == {"v0": 0.1, "v1": 0.1, "v2": 0.1, "a:B": 0.1}
+    exact = ratings.training_plan(0.0, {"random": 0.115, "a:B": 0.125}, prioritized=False)
+    assert {each.player: each.weight for each in exact} == {"random": 0.115, "a:B": 0.125}
 
 
 def test_rating_matches_are_those_that_tell_most() -> None:
