@@ -153,6 +153,9 @@ def _training(record: RunRecord, spec: RunSpec) -> str:
         *((f"{each.name} (times)", f"{each.count:,}") for each in failure_counts(record)),
     ]
     again = "Train it again with the settings in `config.toml`, with any seed:"
+    if record.begun_with:
+        begun = record.begun_with.replace("weights", "the weights of another run")
+        again = f"The run began with {begun}. Its settings are in `config.toml`; to train with these alone:"
     return "\n\n".join(
         ["## Training", _table(("", ""), rows), again, _block(["daedalus train ./config.toml --seed 2"], "bash")]
     )

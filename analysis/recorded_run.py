@@ -36,6 +36,7 @@ from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -397,6 +398,14 @@ class RunRecord(RecordedRun):
     def name(self) -> str:
         """Name of the run."""
         return self.directory.resolve().name
+
+    @property
+    def dataset(self) -> str:
+        """Name of the dataset of its demonstrations, in one line; empty without any that can be read."""
+        with suppress(DamagedError):
+            name = SealedDirectory(self.directory / DEMONSTRATIONS / f"{0:08d}").content.get("dataset")
+            return bounded_text(name) if isinstance(name, str) else ""
+        return ""
 
     @property
     def status(self) -> str:

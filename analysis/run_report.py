@@ -358,6 +358,7 @@ def repeat_section(record: RunRecord) -> ET.Element:
     origin = record.versions.get("init_from")
     others = ["--allow-other-spaces"] if record.versions.get("init_from_other_spaces") else []
     begun = ["--init-from", origin, *others] if origin else []
+    begun += ["--demonstrations", record.dataset] if record.dataset else []
     train = shlex.join(["daedalus", "train", str(record.directory / CONFIG), *begun])
     trust = "The run has code of its author: allow its modules only if you trust that code."
     return section(

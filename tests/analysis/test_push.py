@@ -91,6 +91,7 @@ def test_a_pushed_policy_is_pulled_again(hub: HubServer, capsys: pytest.CaptureF
     assert files["replay.mp4"] == b"a video"
     assert json.loads(files["versions.json"])["gymnasium"] == versions["gymnasium"]
     assert b"/home/ada" not in b"".join(files.values())
+    assert b"The run began with the weights of another run." in files["README.md"]
     assert "checkpoint" not in json.loads(files["evaluation.json"])  # a path of this machine
     pulled, saved = read_policy(pull("ada/cart")), find_policy(run)
     assert (pulled.policy_version, pulled.program, pulled.spec) == (4, saved.program, saved.spec)

@@ -21,6 +21,7 @@ from recorded_runs import record
 from daedalus.analysis import run_report
 from daedalus.cli.commands.report import report
 from daedalus.learner.serving.events import EventFile
+from daedalus.policy.saving.sealed import write_sealed
 from daedalus.protocol.messages import Event
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u202e\x00"
@@ -155,9 +156,11 @@ def test_commands_allow_the_modules_of_a_run_and_begin_with_its_weights(folder: 
     versions = json.loads((run / "versions.json").read_text())
     origin = {"init_from": "/runs/first one", "init_from_other_spaces": True}
     (run / "versions.json").write_text(json.dumps({**versions, **origin}))
+    write_sealed(run / "demonstrations" / "00000000", {}, {"dataset": "pen human"})
     assert report(["run"]) == 0
     text = Page(run / "report.html").text
     train = "daedalus train run/config.toml --init-from '/runs/first one' --allow-other-spaces"
+    train += " --demonstrations 'pen human'"
     assert f"{train}\ndaedalus evaluate run --allow-module corridor The run has code" in text
     assert "daedalus evaluate run --allow-module corridor --record" in text
     assert "continue it with: daedalus resume run --allow-module corridor --allow-module layers" in text
