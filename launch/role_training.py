@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -73,6 +73,15 @@ def check_roles(specs: Mapping[str, RunSpec]) -> None:
         )
 
 
+def shared_settings(specs: Mapping[str, RunSpec]) -> Iterator[str]:
+    """Yield a message for each setting of the actors, which all roles share, that roles set differently."""
+    for name in ("actors", "envs_per_actor"):
+        values = {role: getattr(spec.collection, name) for role, spec in specs.items()}
+        if len({*values.values()}) > 1:
+            each = ", ".join(f"{role} {value}" for role, value in values.items())
+            yield f"collection.{name} differs between the roles ({each}), which share actors: the largest one applies"
+
+
 class RoleTraining:
     """A learner for each role, and actors that take part in all runs, as supervised processes."""
 
@@ -118,6 +127,8 @@ class RoleTraining:
         for role in self._roles:
             self._learners[role.role] = supervised_learner(role.run, address, role.output.unlimited_pipes, joins=True)
         self._choose_seats()
+        for message in shared_settings({role.role: role.run.spec for role in self._roles}):
+            _logger.info("%s", message)
         output, specs = self._output, [role.run.spec for role in self._roles]
         for index in range(max(spec.collection.actors for spec in specs)):
             name = f"actor-{index}"

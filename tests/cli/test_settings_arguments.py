@@ -11,6 +11,7 @@ from daedalus.cli.commands.train import resume_parser, train_parser
 from daedalus.cli.settings_arguments import run_choice
 from daedalus.launch import learner_process
 from daedalus.launch.learner_process import ChosenRun, LearnerNetwork, LearnerProcess, choose_run
+from daedalus.launch.role_training import shared_settings
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
@@ -155,3 +156,13 @@ def test_a_learner_shows_the_lag_in_batches_of_the_settings_for_its_spaces(monke
     with ExitStack() as stack:
         process._serve(process._run, stack)
     assert (before, process._progress.updates_per_batch) == (10 * 16, 4 * 16)
+
+
+def test_settings_of_shared_actors_that_roles_have_different_are_named() -> None:
+    one = spec_of("--env", "CartPole-v1")
+    other = spec_of("--env", "CartPole-v1", "--set", "collection.envs_per_actor=3", "--seed", "2")
+    assert not list(shared_settings({"prey": one, "hunter": one}))
+    assert list(shared_settings({"prey": one, "hunter": other})) == [
+        "collection.envs_per_actor differs between the roles (prey 8, hunter 3), which share actors: the largest one "
+        "applies"
+    ]
