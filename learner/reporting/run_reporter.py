@@ -107,7 +107,7 @@ class RunReporter:
         """
         learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
         context, counters, fleet = self._context, self._counters, self._context.fleet
-        league = self._league() or LeagueStatus()
+        league = None if context.league is None else context.league.status()  # with all opponents
         with context.lock:
             progress = context.progress
             context.health.note_actors(len(fleet.live), now)
@@ -130,7 +130,7 @@ class RunReporter:
                 "updates_skipped": counters.updates_skipped,
                 **learned,
                 **context.evaluations.take_newest(),
-                **league_columns(league),
+                **league_columns(league or LeagueStatus()),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
                 **self._user_metrics.take(),

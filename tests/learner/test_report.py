@@ -22,7 +22,7 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.run_context import Health
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS
-from daedalus.protocol.league import LeagueStatus, RatedPlayer
+from daedalus.protocol.league import NEWEST, LeagueStatus, RatedPlayer, Score
 
 DIAGNOSTICS = (
     *("behaviour_kl", "rho_mean", "rho_effective_share", "rho_clipped_fraction"),
@@ -156,6 +156,12 @@ def test_row_status_and_summary_have_the_league_of_a_game_with_opponents() -> No
     summary = reporter.summary(finished=True, now=0.0)
     assert LeagueStatus.model_validate(json.loads(json.dumps(summary))["league"]) == shown
     assert "league" not in RunReporter(run_context(), UserMetrics()).summary(finished=True, now=0.0)
+    names = [f"bots:Bot{number}" for number in range(30)]
+    players = [RatedPlayer(player=name, rating=0.0, deviation=1.0) for name in (NEWEST, *names)]
+    league = LeagueStatus(
+        players=tuple(players), scores=tuple(Score(first=NEWEST, second=name, wins=1.0) for name in names)
+    )
+    assert sum(name.startswith("win_rate/") for name in reporter.row(learner_with({}), 0.0)) == 30
 
 
 def _version(number: int) -> RatedPlayer:
