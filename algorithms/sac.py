@@ -30,6 +30,7 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 
 QUANTILES = 25  # of each critic of continuous actions, as published
+_FEATURES = 50  # of each image
 DROPPED = 4  # the largest of those of both target critics
 
 
@@ -48,7 +49,8 @@ class TwinCritics(nn.Module):
         """Construct both. The layers have the sizes of `policy.hidden`; see `build_encoder` for the exceptions."""
         super().__init__()
         # Without layers of its own, an encoder of vectors puts all components side by side.
-        self.encoder = build_encoder(spec.model_copy(update={"hidden": ()}), spaces.observations, modules)
+        without_layers = spec.model_copy(update={"hidden": ()})
+        self.encoder = build_encoder(without_layers, spaces.observations, modules, _few_features)
         choice = spaces.only_choice
         self.choices = 0 if choice is None else choice.choices
         actions = 0 if choice is not None else sum(space.size for space in spaces.actions.values())
@@ -89,6 +91,14 @@ class TwinCritics(nn.Module):
         copied = copy.deepcopy(self).bfloat16()
         copied.weights[-1], copied.biases[-1] = self.weights[-1], self.biases[-1]
         return copied
+
+
+def _few_features(inputs: int) -> tuple[nn.Module, int]:
+    """Return what follows the convolutions of the critics: so few outputs that actions count beside them.
+
+    As in the appendix of Kostrikov et al. (2021), "Image Augmentation Is All You Need".
+    """
+    return nn.Sequential(nn.Linear(inputs, _FEATURES), nn.LayerNorm(_FEATURES), nn.Tanh()), _FEATURES
 
 
 def _uniform(inputs: int, shape: tuple[int, ...]) -> nn.Parameter:

@@ -74,13 +74,17 @@ class ImageEncoder(nn.Module):
         self.convolutions = convolutions
         try:
             with torch.no_grad():
-                inputs = convolutions(torch.zeros(1, *layout.shape)).numel()
+                self._inputs = convolutions(torch.zeros(1, *layout.shape)).numel()
         except RuntimeError:
             raise NetworkError(
                 f"the encoder {layout.encoder!r} needs images larger than a {layout.space}: enlarge them "
                 "(environment.resize) or set policy.encoder to impala"
             ) from None
-        self.head, self.features = head(inputs)
+        self.replace_head(head)
+
+    def replace_head(self, head: Callable[[int], tuple[nn.Module, int]]) -> None:
+        """Take another head, as in the constructor."""
+        self.head, self.features = head(self._inputs)
 
     def forward(self, observations: Tensor) -> Tensor:
         """Encode observations: [N, *stacked_shape], or what `convolve` returns of them -> [N, features]."""

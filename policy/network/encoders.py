@@ -5,6 +5,7 @@ several components takes a map of them.
 """
 
 import math
+from collections.abc import Callable
 from itertools import chain
 
 import torch
@@ -18,6 +19,8 @@ from daedalus.policy.network.perceptron import Perceptron
 from daedalus.policy.user_modules import NO_MODULES, NetworkError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces
 from daedalus.protocol.spec import PolicySpec
+
+ImageHead = Callable[[int], tuple[nn.Module, int]]  # from the outputs of convolutions; with its number of outputs
 
 _SMALLEST_FOR_NATURE = 36  # pixels of the shorter side
 
@@ -94,10 +97,12 @@ class ArrayEncoder(nn.Module):
 class CompositeEncoder(nn.Module):
     """An encoder for each image, and a multilayer perceptron for everything else; their features side by side."""
 
-    def __init__(self, images: dict[str, ArraySpace], others: ObservationSpaces, spec: PolicySpec) -> None:
+    def __init__(
+        self, images: dict[str, ArraySpace], others: ObservationSpaces, spec: PolicySpec, head: ImageHead | None
+    ) -> None:
         super().__init__()
         self._names = tuple(images)
-        self._encoders = encoders = [_image_encoder(spec.encoder, space) for space in images.values()]
+        self._encoders = encoders = [_image_encoder(spec.encoder, space, head) for space in images.values()]
         self.images = nn.ModuleList(encoders)
         self.others = FlatEncoder(others, spec) if others else None
         self.features = sum(encoder.features for encoder in encoders)
@@ -131,10 +136,16 @@ def build_codes(spec: PolicySpec, spaces: ObservationSpaces) -> OneHotCodes:
     return OneHotCodes(coded_components(spec, spaces))
 
 
-def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModules = NO_MODULES) -> Encoder:
+def build_encoder(
+    spec: PolicySpec,
+    spaces: ObservationSpaces,
+    modules: UserModules = NO_MODULES,
+    head: ImageHead | None = None,
+) -> Encoder:
     """Return the encoder that the specification names, for observations of the spaces.
 
     Of several components, images go through the named encoder, everything else through the multilayer perceptron.
+    `head` takes the place of what follows the convolutions of an image; see ImageEncoder.
 
     Raises NetworkError if a custom encoder may not or cannot be imported, or the encoder does not accept the
     observations.
@@ -159,12 +170,12 @@ def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModu
         name, space = next(iter(spaces.items()))
         if isinstance(space, DiscreteSpace):
             raise NetworkError(f"the encoder {spec.encoder!r} takes arrays, not {space}: set policy.encoder to mlp")
-        return ArrayEncoder(name, _image_encoder(spec.encoder, space))
+        return ArrayEncoder(name, _image_encoder(spec.encoder, space, head))
     if not images:
         raise NetworkError(
             f"the encoder {spec.encoder!r} takes images, but the observations have none: set policy.encoder to mlp"
         )
-    return CompositeEncoder(images, {name: space for name, space in spaces.items() if name not in images}, spec)
+    return CompositeEncoder(images, {name: space for name, space in spaces.items() if name not in images}, spec, head)
 
 
 def encoder_names(spec: PolicySpec, spaces: ObservationSpaces) -> str:
@@ -182,16 +193,12 @@ def _image_encoder_name(name: str, space: ArraySpace) -> str:
     return "nature" if min(space.image_shape[1:]) >= _SMALLEST_FOR_NATURE else "impala"
 
 
-def _image_encoder(name: str, space: ArraySpace) -> ImageEncoder:
-    match _image_encoder_name(name, space):
-        case "nature":
-            return nature(space)
-        case "small":
-            return small(space)
-        case "impala":
-            return impala(space)
-        case _:
-            return ArticleEncoder(space)
+def _image_encoder(name: str, space: ArraySpace, head: ImageHead | None) -> ImageEncoder:
+    build = {"nature": nature, "small": small, "impala": impala}.get(_image_encoder_name(name, space), ArticleEncoder)
+    encoder = build(space)
+    if head is not None:
+        encoder.replace_head(head)
+    return encoder
 
 
 def _width(space: ArraySpace | DiscreteSpace) -> int:
