@@ -185,11 +185,6 @@ class ReplayBuffer:
         """Indices of all rows that can be sampled, oldest first."""
         return self._queues["learned"].rows
 
-    @property
-    def taught_rows(self) -> np.ndarray:
-        """Indices of all rows that `sample_taught` draws from, oldest first."""
-        return self._queues["taught"].rows
-
     def _observations(self, columns: np.ndarray, rows: np.ndarray) -> Components:
         """Return the observations of rows, with their stacks."""
         found: Components = {}

@@ -96,9 +96,9 @@ def performance_profile(strata: Strata, thresholds: np.ndarray) -> np.ndarray:
     return _shares_above([scores[None] for scores in strata], thresholds)[0]
 
 
-def profile_interval(strata: Strata, thresholds: np.ndarray, *, seed: int = 0) -> Interval:
+def profile_interval(strata: Strata, thresholds: np.ndarray) -> Interval:
     """Return the pointwise interval of a performance profile, [thresholds]. See stratified_bootstrap."""
-    return stratified_bootstrap(strata, lambda samples: _shares_above(samples, thresholds), seed=seed)
+    return stratified_bootstrap(strata, lambda samples: _shares_above(samples, thresholds))
 
 
 def _shares_above(samples: Strata, thresholds: np.ndarray) -> np.ndarray:
@@ -124,9 +124,9 @@ def probability_of_improvement(first: Strata, second: Strata) -> float:
     return float(_improvements([*(x[None] for x in first), *(y[None] for y in second)])[0])
 
 
-def improvement_interval(first: Strata, second: Strata, *, seed: int = 0) -> Interval:
+def improvement_interval(first: Strata, second: Strata) -> Interval:
     """Return the interval of the probability of improvement; the runs of both are resampled."""
-    return stratified_bootstrap([*first, *second], _improvements, seed=seed)
+    return stratified_bootstrap([*first, *second], _improvements)
 
 
 def _improvements(samples: Strata) -> np.ndarray:

@@ -240,11 +240,8 @@ class SweepEnd:
 class Sweep:
     """Runs of a search, until all have ended or the sweep is stopped."""
 
-    def __init__(
-        self, search: Search, processes: RunProcesses, display: Display, done: Callable[[PlannedRun], bool] = is_done
-    ) -> None:
-        """`done` tells whether a run needs no process any more."""
-        self._search, self._processes, self._display, self._is_done = search, processes, display, done
+    def __init__(self, search: Search, processes: RunProcesses, display: Display) -> None:
+        self._search, self._processes, self._display = search, processes, display
         self._end = SweepEnd()
         self._kept = 0  # runs that had ended before this sweep
 
@@ -274,7 +271,7 @@ class Sweep:
             run = self._search.take()
             if run is None:
                 break
-            if self._is_done(run):
+            if is_done(run):
                 self._kept += 1
                 self._end.done.append(run)
                 self._search.ended(run, failed=False)
@@ -294,7 +291,7 @@ class Sweep:
         failure = ""
         if status not in FINISHED:
             failure = reason(run.log, status)
-        elif not self._is_done(run):
+        elif not is_done(run):
             failure = f"it ended without a result; see {run.log}"
         if failure:
             self._end.failed[run.name] = failure

@@ -48,7 +48,7 @@ def play_at_terminal(options: EvaluationOptions, seat: str | None, stop: threadi
     policy = chosen_policy(options)
     spec = policy.spec.for_actors().model_copy(update={"environment": environment_of(policy, options)})
     with Surroundings():
-        match = PersonMatch(spec, modules_of(policy, options), shown=True)
+        match = PersonMatch(spec, modules_of(policy, options))
         try:
             if seat is not None and seat not in match.agents:
                 raise EnvironmentSetupError(f"--seat is {seat!r}: choose from {', '.join(match.agents)}")

@@ -55,7 +55,7 @@ class CertificateAuthority:
             raise CredentialsError(
                 f"{directory / KEY} is not an elliptic-curve key: create a CA with `daedalus certs init`"
             )
-        self._directory, self._key = directory, key
+        self._key = key
 
     @classmethod
     def create(cls, directory: Path, common_name: str, lifetime: datetime.timedelta) -> "CertificateAuthority":

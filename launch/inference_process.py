@@ -6,7 +6,6 @@ they use. The busier it is, the more actors wait, and the larger the calls.
 
 import argparse
 import json
-import logging
 import os
 import selectors
 import socket
@@ -37,8 +36,6 @@ from daedalus.policy.user_code import message_line
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LearningSpec
 from daedalus.transport.process_usage import available_processors
-
-_logger = logging.getLogger(__name__)
 
 _MAX_ROWS = 256  # in one call, unless one actor has more: its memory is limited
 _POLL_SECONDS = 0.2

@@ -31,13 +31,10 @@ class LogOptions:
         *,
         process: str = "",
         context: Mapping[str, str] | None = None,
-        prefix: str = "",
         write: Callable[[str], None] | None = None,
     ) -> None:
         """See configure_logging."""
-        configure_logging(
-            self.level, as_json=self.as_json, process=process, context=context, prefix=prefix, write=write
-        )
+        configure_logging(self.level, as_json=self.as_json, process=process, context=context, write=write)
 
 
 def configure_logging(

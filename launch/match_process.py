@@ -42,7 +42,7 @@ class _Table:
         """Raises EnvironmentSetupError or PolicyError."""
         self._spec = welcome.spec
         self._runtime = OnnxRuntime(program.model.tobytes(), stop)
-        self._match = PersonMatch(welcome.spec, modules, shown=True)
+        self._match = PersonMatch(welcome.spec, modules)
         self._agent, self._version = self._match.agents[0], 0
         self._turn: Turn | None = None
 

@@ -64,22 +64,3 @@ class ObservationStacks:
         """Add the next frame of each component and environment; arguments as for FrameStack."""
         for name, stack in self._stacks.items():
             stack.push(frames[name], starts, where)
-
-
-def stack_rows(frames: np.ndarray, valid: np.ndarray, out: np.ndarray) -> None:
-    """Compute the observations of all rows of a rollout.
-
-    Args:
-      frames: [k-1 + T+1, E, *frame_shape]; the first k are the complete stack of row 0.
-      valid: [T, E] bool; an episode starts after each row that is not valid.
-      out: [T+1, E, k, *frame_shape], filled by this function; k is taken from its shape.
-    """
-    rows, depth = out.shape[0], out.shape[2]
-    for age in range(depth):
-        out[:, :, age] = frames[age : age + rows]
-    for row, environment in np.argwhere(~valid):
-        start = row + 1  # the first row of the new episode
-        first = frames[start + depth - 1, environment]
-        for later in range(start, min(start + depth - 1, rows)):
-            # In this row's stack, the first depth - 1 - (later - start) frames are from before the start.
-            out[later, environment, : depth - 1 - (later - start)] = first

@@ -1,12 +1,14 @@
 """Slow reference implementations of the papers' sums, for one environment of one rollout.
 
 The notation is that of the papers: gamma is the discount factor, V the values [T+1] and r the rewards [T]. Reset rows
-are in no sum, because a sum stops at the end of its episode.
+are in no sum, because a sum stops at the end of its episode. `stack_rows` is one of the frame stacks of a rollout.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,3 +86,22 @@ def vtrace_advantage(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar:
     following = vtrace(x, gamma, lam, rho_bar, c_bar, s + 1) if inside else bootstrap(x, s + 1)
     mixed = (1.0 - lam) * bootstrap(x, s + 1) + lam * following
     return x.r[s] + gamma * mixed - x.V[s]
+
+
+def stack_rows(frames: np.ndarray, valid: np.ndarray, out: np.ndarray) -> None:
+    """Compute the observations of all rows of a rollout from its frames, as the learner does: see protocol/frames.py.
+
+    Args:
+      frames: [k-1 + T+1, E, *frame_shape]; the first k are the complete stack of row 0.
+      valid: [T, E] bool; an episode starts after each row that is not valid.
+      out: [T+1, E, k, *frame_shape], filled by this function; k is taken from its shape.
+    """
+    rows, depth = out.shape[0], out.shape[2]
+    for age in range(depth):
+        out[:, :, age] = frames[age : age + rows]
+    for row, environment in np.argwhere(~valid):
+        start = row + 1  # the first row of the new episode
+        first = frames[start + depth - 1, environment]
+        for later in range(start, min(start + depth - 1, rows)):
+            # In this row's stack, the first depth - 1 - (later - start) frames are from before the start.
+            out[later, environment, : depth - 1 - (later - start)] = first

@@ -152,14 +152,6 @@ def _arguments(method: Callable[..., object]) -> tuple[str, ...] | None:
     return None
 
 
-def parameters_of(environment: gymnasium.Env) -> tuple[str, ...]:
-    """Return the names that the environment's `set_parameters` takes; empty if it has none or does not say."""
-    with suppress(Exception, SystemExit):  # of the user's code
-        if environment.has_wrapper_attr(_METHOD):
-            return _arguments(environment.get_wrapper_attr(_METHOD)) or ()
-    return ()
-
-
 def wrapper_of(environment: gymnasium.Env) -> WithParameters:
     """Return the wrapper that sets the parameters of an environment, which has one."""
     while not isinstance(environment, WithParameters):

@@ -42,11 +42,8 @@ class Turn:
 class PersonMatch:
     """One copy of the game of a run, for one match after the other."""
 
-    def __init__(self, spec: ActorSpec, modules: UserModules, *, shown: bool = False) -> None:
-        """Make the game. Raises EnvironmentSetupError, also if the run plays no game with several agents.
-
-        `shown`: whether `picture` is needed.
-        """
+    def __init__(self, spec: ActorSpec, modules: UserModules) -> None:
+        """Make the game. Raises EnvironmentSetupError, also if the run plays no game with several agents."""
         environment = spec.environment
         if not environment.is_game:
             raise EnvironmentSetupError(
@@ -57,7 +54,7 @@ class PersonMatch:
             modules.check(environment.user_modules)
         except UserModuleError as error:
             raise EnvironmentSetupError(str(error)) from None
-        self._games = make_games(environment, 1, modules, shown=shown)
+        self._games = make_games(environment, 1, modules, shown=True)
         try:
             self._environment = TransformedEnvironment(self._games, environment)
         except EnvironmentSetupError:

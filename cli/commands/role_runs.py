@@ -1,7 +1,6 @@
 """`daedalus train` and `daedalus resume` for games whose roles have different spaces: a run for each role."""
 
 import argparse
-import logging
 import shlex
 import sys
 from collections.abc import Mapping
@@ -34,8 +33,6 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.user_modules import UserModuleError, allow_settings
 from daedalus.protocol.spec import RunSpec
-
-_logger = logging.getLogger(__name__)
 
 _FAULTS = (EnvironmentProblemError, RunInUseError, SettingsError, UserModuleError)
 

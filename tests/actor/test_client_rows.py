@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import stack_rows
 
 from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
@@ -15,7 +16,6 @@ from daedalus.learner.serving.rollout_judge import episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.frames import stack_rows
 from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 

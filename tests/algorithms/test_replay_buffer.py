@@ -101,7 +101,9 @@ def test_transitions_are_those_of_the_newest_columns(
         for chosen in (Column.is_learned, Column.is_taught)
     )
     assert (len(buffer), buffer.taught) == (len(learned), len(taught))
-    found = buffer.transitions(np.concatenate([buffer.learned_rows, buffer.taught_rows]), n_step, 0.9)
+    found = buffer.transitions(
+        np.concatenate([buffer._queues[kind].rows for kind in ("learned", "taught")]), n_step, 0.9
+    )
     for index, (column, row) in enumerate([*learned, *taught]):
         total, discount, following = column.target(row, n_step, 0.9)
         assert float(found.rewards[index]) == pytest.approx(total, abs=1e-5)

@@ -11,13 +11,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import stack_rows
 from plain import ACTION, NAME, plain_spaces
 
 from daedalus.actor.environments.vector_environments import Observed, Step
 from daedalus.policy.acting.noise import Noise, NoiseSize
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.codec import decode, encode
-from daedalus.protocol.frames import FrameStack, stack_rows
+from daedalus.protocol.frames import FrameStack
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
