@@ -54,7 +54,7 @@ class Batch:
 
     def moved(self, move: Callable[[Tensor], Tensor]) -> "Batch":
         """Return the batch with a function applied to each of its tensors."""
-        changed: dict[str, Any] = {name: map_components(getattr(self, name), move) for name in _MAPS}
+        changed: dict[str, Any] = {name: map_components(getattr(self, name), move) for name in MAPS}
         changed |= {name: move(getattr(self, name)) for name in _ARRAYS}
         return replace(self, **changed, passes=[Pass(*map(move, each)) for each in self.passes])
 
@@ -75,7 +75,7 @@ class Batch:
         return found
 
 
-_MAPS = ("observations", "actions", "masks")
+MAPS = ("observations", "actions", "masks")  # the fields with one array for each component
 _ARRAYS = ("initial_state", "starts", "behaviour_log_probs", "rewards", "terminated", "truncated", "valid")
 
 

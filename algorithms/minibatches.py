@@ -8,7 +8,7 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch, Pass
+from daedalus.algorithms.batch import MAPS, Batch, Pass
 from daedalus.algorithms.losses import shares_of
 from daedalus.policy.network.layers import Components, map_components
 
@@ -35,17 +35,16 @@ class Minibatch:
 
     def tensors(self) -> list[Tensor]:
         """Return all tensors of the minibatch, in the order of the fields."""
-        maps = (getattr(self, name).values() for name in _MAPS)
+        maps = (getattr(self, name).values() for name in MAPS)
         return [*chain.from_iterable(maps), *(getattr(self, name) for name in _ARRAYS)]
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> "Minibatch":
         """Return a minibatch with other tensors, in the order of `tensors`."""
         remaining = iter(tensors)
-        maps = {name: {key: next(remaining) for key in getattr(self, name)} for name in _MAPS}
+        maps = {name: {key: next(remaining) for key in getattr(self, name)} for name in MAPS}
         return replace(self, **maps, **dict(zip(_ARRAYS, remaining, strict=True)))
 
 
-_MAPS = ("observations", "actions", "masks")
 _ARRAYS = ("initial_state", "starts", "log_probs", "values", "targets", "factors", "shares")
 
 

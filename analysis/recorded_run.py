@@ -33,7 +33,7 @@ from daedalus.learner.run.run_directory import (
 )
 from daedalus.learner.run.run_files import RunDataError, read_end, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
-from daedalus.learner.run.settings import SettingsError, run_spec
+from daedalus.learner.run.settings import SettingsError, flat_settings, run_spec
 from daedalus.learner.serving.events import RecordedEvent, read_events
 from daedalus.policy.saving.regular_files import open_regular
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory
@@ -250,17 +250,7 @@ def read_run_settings(directory: Path) -> dict[str, Any]:
         settings = run_spec(settings).model_dump(mode="json")
     except SettingsError:  # another release may have had settings that this one does not have
         settings = json.loads(json.dumps(settings, default=str))  # TOML has dates, too
-    return {path: value for path, value in _flat(settings).items() if _is_usable(path, value)}
-
-
-def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of all sections by `section.key`."""
-    return {
-        f"{section}.{key}": value
-        for section, values in settings.items()
-        if isinstance(values, dict)
-        for key, value in values.items()
-    }
+    return {path: value for path, value in flat_settings(settings).items() if _is_usable(path, value)}
 
 
 def _is_usable(setting: str, value: Any) -> bool:

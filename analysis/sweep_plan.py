@@ -11,7 +11,7 @@ from typing import Any
 from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.setting_errors import types_of
-from daedalus.learner.run.settings import SettingsError, read_value
+from daedalus.learner.run.settings import SettingsError, flat_settings, read_value
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import RunSpec
 
@@ -232,5 +232,4 @@ def _check_same(run: PlannedRun) -> None:
 
 
 def _flat(spec: RunSpec) -> dict[str, Any]:
-    content = spec.model_dump(mode="json", exclude={"training": {"algorithm_record"}})
-    return {f"{section}.{key}": value for section, values in content.items() for key, value in values.items()}
+    return flat_settings(spec.model_dump(mode="json", exclude={"training": {"algorithm_record"}}))

@@ -23,9 +23,15 @@ def command_parser(name: str, description: str, examples: str) -> argparse.Argum
     )
 
 
-def add_connect(options: argparse._ActionsContainer, help: str, *, required: bool = True) -> None:
+def add_connect(options: argparse._ActionsContainer, *, required: bool = True) -> None:
     """Add --connect, which may be given several times."""
-    options.add_argument("--connect", required=required, action="append", metavar="tcp/HOST:PORT", help=help)
+    options.add_argument(
+        "--connect",
+        required=required,
+        action="append",
+        metavar="tcp/HOST:PORT",
+        help="address of the learner or of its router. May be given several times",
+    )
 
 
 def add_tls(options: argparse._ActionsContainer) -> None:

@@ -3,6 +3,9 @@
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
+HELLO_SECONDS = 10.0  # from the connection to the hello
+SEND_SECONDS = 5.0  # for the last message
+
 
 class Channel(Protocol):
     """One WebSocket."""

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from daedalus.gateway import client_messages
-from daedalus.gateway.channel import channel_of
+from daedalus.gateway.channel import HELLO_SECONDS, SEND_SECONDS, channel_of
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.client_messages import (
@@ -27,8 +27,6 @@ from daedalus.gateway.security import MESSAGES_BURST, MESSAGES_PER_SECOND, Guard
 
 _logger = logging.getLogger(__name__)
 
-HELLO_SECONDS = 10.0  # from the connection to the hello
-_SEND_SECONDS = 5.0  # for the last message
 _MAX_UNANSWERED = 8  # messages of one client; then reading pauses
 _MAX_EARLY = 2  # messages of one client that are read before it is admitted
 _MAX_FAULTS = 10  # of one client; then it is disconnected
@@ -248,6 +246,6 @@ class ClientConnection:
         else:
             message, code = client_messages.error(reason), _TRY_LATER if reason.code == "unavailable" else _FAULT
         with contextlib.suppress(TimeoutError, OSError):  # OSError: the client is gone
-            async with asyncio.timeout(_SEND_SECONDS):
+            async with asyncio.timeout(SEND_SECONDS):
                 self._write(message)
                 await self._send_event({"type": "websocket.close", "code": code})

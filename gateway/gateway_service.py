@@ -26,6 +26,7 @@ from daedalus.gateway.watching.person_matches import Matches
 from daedalus.gateway.watching.playing_process import PolicySource
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import Order
+from daedalus.transport.addresses import bracketed
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
@@ -89,7 +90,7 @@ class GatewayService:
         settings, port = self._settings, listener.getsockname()[1]
         tokens = None if settings.serving is None else Tokens(settings.serving.directory)
         tls = None if settings.serving is None else tls_context(settings.serving.directory)
-        certified = [] if settings.serving is None else _bracketed(settings.serving.hosts())
+        certified = [] if settings.serving is None else list(map(bracketed, settings.serving.hosts()))
         names = [*LOOPBACK, *settings.hosts, *certified, socket.gethostname()]
         # Whoever reaches a plain TCP address may ask its learner for the status: the page may show it to everybody.
         openly = settings.operator is None and all(address.startswith("tcp/") for address in settings.connect)
@@ -201,7 +202,3 @@ class GatewayService:
         else:
             self._gateway.set_exception(ClientError("unavailable", "the gateway stops"))
             self._gateway.exception()  # read, whether or not a client waits
-
-
-def _bracketed(hosts: list[str]) -> list[str]:
-    return [f"[{host}]" if ":" in host else host for host in hosts]

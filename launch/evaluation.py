@@ -141,8 +141,7 @@ def evaluate(
     try:
         result = run_evaluation(options, threading.Event(), io.StringIO())
     except ModuleNotAllowedError as error:
-        remedy = f"if you trust that code, pass allow_modules={list(error.modules)}"
-        raise EnvironmentSetupError(f"{error.reason}; {remedy}") from None
+        raise EnvironmentSetupError(error.in_python) from None
     return EvaluationResult(
         returns=np.array(result["returns"], np.float64),
         lengths=np.array(result["lengths"], np.int64),

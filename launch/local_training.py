@@ -56,9 +56,9 @@ _logger = logging.getLogger(__name__)
 FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
 
 _POLL_SECONDS = 0.05
-_EVALUATOR = "evaluator"
+EVALUATOR = "evaluator"
 _CONFIRMATION = "confirmation"
-_HELPERS = {_EVALUATOR, _CONFIRMATION, GATEWAY}  # processes without which a run goes on
+_HELPERS = {EVALUATOR, _CONFIRMATION, GATEWAY}  # processes without which a run goes on
 _SUMMARY_SECONDS = 30.0  # for the learner to write its summary after a callback ended training
 
 
@@ -101,7 +101,7 @@ def train(
                 run.directory,
             )
             if spec.evaluation.seconds is not None:
-                actors.append(player(_EVALUATOR, address, (*options, "--evaluator")))
+                actors.append(player(EVALUATOR, address, (*options, "--evaluator")))
             if run.player_address is not None:
                 waiting = (*options, "--evaluator", "--stay")
                 actors.append(player(_CONFIRMATION, run.player_address, waiting))

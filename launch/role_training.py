@@ -16,7 +16,7 @@ from daedalus.launch.local_run import (
     actor_arguments,
     helper_log_words,
 )
-from daedalus.launch.local_training import FINISHED, stopped_by, supervised_learner
+from daedalus.launch.local_training import EVALUATOR, FINISHED, stopped_by, supervised_learner
 from daedalus.launch.process_lifecycle import ORDERED, UNSAVED
 from daedalus.launch.supervision import (
     LEARNER_GRACE_SECONDS,
@@ -39,7 +39,6 @@ from daedalus.transport.private_address import private_address
 _logger = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.05
-_EVALUATOR = "evaluator"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,7 +144,7 @@ class RoleTraining:
         for role in self._roles:
             if role.run.spec.evaluation.seconds is not None:
                 options, output = (*actor_arguments(role.run), "--evaluator", "--run", role.name), role.output
-                evaluator = supervised_actor(_EVALUATOR, address, options, output.pipes, output.last_error)
+                evaluator = supervised_actor(EVALUATOR, address, options, output.pipes, output.last_error)
                 self._evaluators[role.role] = evaluator
                 self._players.append(evaluator)
             trackers = TrackerProcesses(role.run.log, role.run.directory, role.output, log_json=role.run.logs.as_json)
@@ -208,7 +207,7 @@ class RoleTraining:
                 except FailedError as error:
                     self._players.remove(player)
                     stop([player.process])
-                    if all(each.name == _EVALUATOR for each in self._players):
+                    if all(each.name == EVALUATOR for each in self._players):
                         raise FailedError("all actors", error.reason, "failed") from None
                     note(f"{error}; training continues without this process", *owners)
         raise RunStoppedError

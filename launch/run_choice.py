@@ -19,6 +19,7 @@ from daedalus.learner.run.settings import (
     assign,
     changed_settings,
     choose_algorithm,
+    flat_settings,
     override,
     preset_names,
     read_preset,
@@ -96,9 +97,7 @@ class RunChoice:
         """Return the settings that were chosen; of a file, those that differ from the defaults of this release."""
         chosen = self.assigned
         if self.preset is not None and self.preset not in preset_names():
-            sections = read_preset(self.preset)
-            values = {f"{section}.{key}": each for section in sections for key, each in sections[section].items()}
-            chosen.update(changed_settings(values))
+            chosen.update(changed_settings(flat_settings(read_preset(self.preset))))
         return chosen
 
     def directory(self, spec: RunSpec) -> Path:

@@ -206,8 +206,7 @@ def resume(
             spec = choice.spec(from_python=given.maker is not None)
             lock, init_from = locked_to_resume(directory)
         except ModuleNotAllowedError as error:
-            remedy = f"if you trust that code, pass allow_modules={list(error.modules)}"
-            raise SettingsError(f"{error.reason}; {remedy}") from None
+            raise SettingsError(error.in_python) from None
         except UserModuleError as error:
             raise SettingsError(str(error)) from None
         except RunInUseError as error:

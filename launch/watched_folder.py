@@ -9,7 +9,7 @@ from typing import Any
 from daedalus.gateway.watching.page_data import FolderView
 from daedalus.learner.run.run_directory import CONFIG, OUTPUT, REPORT, SUMMARY, read_config, run_name
 from daedalus.learner.run.run_files import RunDataError, read_end, read_json
-from daedalus.learner.run.settings import SettingsError, changed_settings, setting_text
+from daedalus.learner.run.settings import SettingsError, changed_settings, flat_settings, setting_text
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.texts import printable, short_number
 
@@ -45,11 +45,7 @@ class WatchedFolder:
     def _settings(self) -> tuple[tuple[str, str, bool], ...]:
         spec = read_config(self._directory)
         self._modules = spec.user_modules
-        values = {
-            f"{section}.{key}": value
-            for section, part in spec.model_dump(mode="json").items()
-            for key, value in part.items()
-        }
+        values = flat_settings(spec.model_dump(mode="json"))
         changed = set(changed_settings(values))
         return tuple(
             (path, printable(setting_text(value)), path in changed)

@@ -44,6 +44,11 @@ class ModuleNotAllowedError(UserModuleError):
         super().__init__(f"{reason}; if you trust that code, add {' '.join(allow_words(modules))}")
         self.reason, self.modules = reason, modules
 
+    @property
+    def in_python(self) -> str:
+        """The message for a caller of a function that has `allow_modules`."""
+        return f"{self.reason}; if you trust that code, pass allow_modules={list(self.modules)}"
+
 
 @dataclass(frozen=True, slots=True)
 class UserModules:

@@ -125,7 +125,7 @@ def reachable(endpoints: Sequence[str], certificate_hosts: Sequence[str] = ()) -
         protocol, _, rest = endpoint.partition("/")
         host, _, port = rest.rpartition(":")
         if _is_unspecified(host.strip("[]")):
-            found += [f"{protocol}/{_bracketed(each)}:{port}" for each in _hosts(certificate_hosts)]
+            found += [f"{protocol}/{bracketed(each)}:{port}" for each in _hosts(certificate_hosts)]
         else:
             found.append(endpoint)
     return list(dict.fromkeys(found))
@@ -150,5 +150,6 @@ def _is_unspecified(host: str) -> bool:
     return False
 
 
-def _bracketed(host: str) -> str:
+def bracketed(host: str) -> str:
+    """Return a host as it stands before a port: an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host

@@ -315,8 +315,7 @@ def load_policy(
         try:
             modules.check(saved.spec.environment.user_modules)
         except ModuleNotAllowedError as error:
-            remedy = f"if you trust that code, pass allow_modules={list(error.modules)}"
-            raise EnvironmentSetupError(f"{error.reason}; {remedy}") from error
+            raise EnvironmentSetupError(error.in_python) from error
         environment = _make(saved.spec, modules)
         environment.close()
         observation_space, action_space = environment.observation_space, environment.action_space

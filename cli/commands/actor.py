@@ -57,7 +57,7 @@ actor ends by a signal, a drain, wrong arguments or its --timeout; after any oth
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus actor`."""
     options = command_parser("actor", DESCRIPTION, EXAMPLES)
-    add_connect(options, "address of the learner or of its router. May be given several times")
+    add_connect(options)
     options.add_argument(
         "--envs",
         type=int,

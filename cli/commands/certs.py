@@ -179,7 +179,11 @@ def _issue_operators(folder: "CertificateFolder", identities: "list[Identity]", 
 def _issue_tokens(folder: "CertificateFolder", names: list[str], days: int) -> list[str]:
     ClientTokens(folder.directory).issue(names, days)
     lines = [f"{folder.directory}/client-{name}/token    give this token to the client" for name in names]
-    return [*lines, f"a gateway on another host: copy {folder.directory}/gateway/tokens.json to its folder"]
+    return [*lines, _copy_tokens(folder)]
+
+
+def _copy_tokens(folder: "CertificateFolder") -> str:
+    return f"a gateway on another host: copy {folder.directory}/gateway/tokens.json to its folder"
 
 
 def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
@@ -222,7 +226,7 @@ def _renew_certificates(
 def _revoke(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
     if parsed.role == "client":
         ClientTokens(folder.directory).revoke(parsed.names)
-        return [f"a gateway on another host: copy {folder.directory}/gateway/tokens.json to its folder"]
+        return [_copy_tokens(folder)]
     folder.revoke(_named(parsed))
     if parsed.role == "operator":
         ClientTokens(folder.directory).revoke_operators(parsed.names)

@@ -5,7 +5,7 @@ import itertools
 from pathlib import Path
 
 from daedalus.analysis.comparison import as_csv, as_text, compare_groups
-from daedalus.analysis.recorded_run import SECONDS
+from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS
 from daedalus.analysis.run_groups import select
 from daedalus.cli.arguments import command_parser
 from daedalus.launch.logs import print_error, say
@@ -38,13 +38,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus compare`."""
     options = command_parser("compare", _DESCRIPTION, _EXAMPLES)
     options.usage = "daedalus compare [-h] [--threshold RETURN] [--csv FILE] RUN_DIR... [-- RUN_DIR...]"
-    options.add_argument(
-        "directories",
-        nargs="+",
-        type=Path,
-        metavar="RUN_DIR",
-        help="runs to compare; FOLDER@TAG: those in a folder that have a tag (daedalus runs)",
-    )
+    add_runs(options, "compare")
     options.add_argument(
         "--threshold",
         type=float,
@@ -53,6 +47,24 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument("--csv", type=Path, metavar="FILE", help="also write the table to this file, as CSV")
     return options
+
+
+def add_runs(options: argparse.ArgumentParser, verb: str) -> None:
+    """Add the run directories of a command; `verb` says what it does with the runs."""
+    options.add_argument(
+        "directories",
+        nargs="+",
+        type=Path,
+        metavar="RUN_DIR",
+        help=f"runs to {verb}; FOLDER@TAG: those in a folder that have a tag (daedalus runs)",
+    )
+
+
+def add_axis(options: argparse.ArgumentParser) -> None:
+    """Add --by, for commands that draw curves."""
+    options.add_argument(
+        "--by", choices=(ENV_STEPS, "minutes"), default=ENV_STEPS, help="horizontal axis (default: %(default)s)"
+    )
 
 
 def compare(arguments: list[str]) -> int:

@@ -25,7 +25,7 @@ exit status: 0 stopped by a signal, 1 the address is in use or the certificate i
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus exporter`."""
     options = command_parser("exporter", _DESCRIPTION, _EXAMPLES)
-    add_connect(options, "address of the learner or of its router. May be given several times")
+    add_connect(options)
     options.add_argument(
         "--listen",
         default=_LISTEN,

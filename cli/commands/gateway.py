@@ -48,7 +48,7 @@ exit status: 0 stopped by a signal, 1 failed, 2 bad usage"""
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus gateway`."""
     options = command_parser("gateway", DESCRIPTION, EXAMPLES)
-    add_connect(options, "address of the learner or of its router. May be given several times")
+    add_connect(options)
     options.add_argument(
         "--run", default=keys.ANY_RUN, metavar="NAME", help="run to follow, if several runs share a network"
     )

@@ -61,7 +61,6 @@ examples:
 
 exit status: 0 the actors have left, 1 failed, 2 bad usage"""
 
-_ADDRESS = "address of the learner or of its router. May be given several times"
 _POLL_SECONDS = 0.5
 
 
@@ -82,7 +81,7 @@ def checkpoint_parser() -> argparse.ArgumentParser:
 def _run_parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
     options = command_parser(name, description, examples)
     options.add_argument("run", metavar="RUN", help="name of the run, as `daedalus status` shows it")
-    add_connect(options, _ADDRESS)
+    add_connect(options)
     add_tls(options)
     return options
 
@@ -91,7 +90,7 @@ def drain_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus drain`."""
     options = command_parser("drain", _DRAIN, _DRAIN_EXAMPLES)
     options.add_argument("actors", nargs="+", metavar="ACTOR", help="name of an actor, as `daedalus status` shows it")
-    add_connect(options, _ADDRESS)
+    add_connect(options)
     options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="run that the actors take part in")
     options.add_argument(
         "--timeout", type=seconds, metavar="SECONDS", help="time to wait for the actors to leave (default: no limit)"

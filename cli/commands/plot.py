@@ -9,7 +9,7 @@ from daedalus.analysis.charts import COLUMNS, INSTALL, draw_curves, draw_profile
 from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS
 from daedalus.analysis.run_groups import environment_of, select
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.commands.compare import parse_groups
+from daedalus.cli.commands.compare import add_axis, add_runs, parse_groups
 from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 
@@ -38,22 +38,11 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus plot`."""
     options = command_parser("plot", _DESCRIPTION, _EXAMPLES)
     options.usage = "daedalus plot [-h] --output FILE [--by env_steps|minutes] [--profile] RUN_DIR... [-- RUN_DIR...]"
-    options.add_argument(
-        "directories",
-        nargs="+",
-        type=Path,
-        metavar="RUN_DIR",
-        help="runs to draw; FOLDER@TAG: those in a folder that have a tag (daedalus runs)",
-    )
+    add_runs(options, "draw")
     options.add_argument(
         "--output", type=_picture, required=True, metavar="FILE", help="picture to write: .png, .svg or .pdf"
     )
-    options.add_argument(
-        "--by",
-        choices=(ENV_STEPS, "minutes"),
-        default=ENV_STEPS,
-        help="horizontal axis (default: %(default)s)",
-    )
+    add_axis(options)
     options.add_argument(
         "--profile",
         action="store_true",

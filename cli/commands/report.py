@@ -8,7 +8,7 @@ from daedalus.analysis.recorded_run import ENV_STEPS, SECONDS, read_record
 from daedalus.analysis.run_groups import select
 from daedalus.analysis.run_report import comparison_page, run_page
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.commands.compare import parse_groups
+from daedalus.cli.commands.compare import add_axis, add_runs, parse_groups
 from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_directory import REPORT
 from daedalus.learner.run.run_files import RunDataError
@@ -38,22 +38,14 @@ def parser() -> argparse.ArgumentParser:
     options.usage = (
         "daedalus report [-h] [--output FILE] [--by env_steps|minutes] [--threshold RETURN] RUN_DIR... [-- RUN_DIR...]"
     )
-    options.add_argument(
-        "directories",
-        nargs="+",
-        type=Path,
-        metavar="RUN_DIR",
-        help="runs to report; FOLDER@TAG: those in a folder that have a tag (daedalus runs)",
-    )
+    add_runs(options, "report")
     options.add_argument(
         "--output",
         type=Path,
         metavar="FILE",
         help=f"file to write (default: {REPORT} in the directory of the run, or here for several runs)",
     )
-    options.add_argument(
-        "--by", choices=(ENV_STEPS, "minutes"), default=ENV_STEPS, help="horizontal axis (default: %(default)s)"
-    )
+    add_axis(options)
     options.add_argument(
         "--threshold",
         type=float,

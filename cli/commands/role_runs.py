@@ -14,6 +14,7 @@ from daedalus.cli.commands.train import (
     left_report,
     machine_options,
     report,
+    resume_choice,
     show,
 )
 from daedalus.cli.screen import Screen
@@ -23,7 +24,7 @@ from daedalus.launch.local_run import LocalRun, RunFailedError, RunStoppedError,
 from daedalus.launch.local_training import evaluate_run
 from daedalus.launch.logs import print_error, say
 from daedalus.launch.process_lifecycle import exit_with_parent, status_at_start, stop_on_signals
-from daedalus.launch.resumed_run import ResumeChoice, locked_to_resume, resumed_run, status_of
+from daedalus.launch.resumed_run import locked_to_resume, resumed_run, status_of
 from daedalus.launch.role_training import RoleRun, RoleTraining, check_roles, seats_of
 from daedalus.launch.run_choice import NewRun, create_run
 from daedalus.learner.run import run_directory
@@ -144,13 +145,7 @@ def _resumed(parsed: argparse.Namespace, directories: Mapping[str, Path], starte
     over: dict[str, LocalRun] = {}
     missed = False
     for role, directory in directories.items():
-        choice = ResumeChoice(
-            directory=directory,
-            env_steps=parsed.env_steps,
-            assignments=parsed.set,
-            allowed_modules=frozenset(parsed.allow_module),
-            reset_statistics=parsed.reset_statistics,
-        )
+        choice = resume_choice(parsed, directory)
         spec = choice.spec()
         lock, init_from = locked_to_resume(directory)
         stack.enter_context(lock)

@@ -65,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus status`."""
     options = command_parser("status", _DESCRIPTION, _EXAMPLES)
     where = options.add_mutually_exclusive_group(required=True)
-    add_connect(where, "address of the learner or of its router. May be given several times", required=False)
+    add_connect(where, required=False)
     where.add_argument(
         "--alive",
         type=Path,

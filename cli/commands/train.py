@@ -165,13 +165,7 @@ def resume(arguments: list[str]) -> int:
 
             return resume_roles(parsed, directories, screen, started)
         _warn_of_role(parsed.directory)
-        choice = ResumeChoice(
-            directory=parsed.directory,
-            env_steps=parsed.env_steps,
-            assignments=parsed.set,
-            allowed_modules=frozenset(parsed.allow_module),
-            reset_statistics=parsed.reset_statistics,
-        )
+        choice = resume_choice(parsed, parsed.directory)
         spec = choice.spec()
         lock, init_from = locked_to_resume(parsed.directory)
     except ModuleNotAllowedError as error:
@@ -194,6 +188,17 @@ def resume(arguments: list[str]) -> int:
             return status_of(run)
         run = replace(run, **machine_options(parsed, lock.directory))
         return _run(run, screen, lock, exits_with_parent=parsed.exit_with_parent)
+
+
+def resume_choice(parsed: argparse.Namespace, directory: Path) -> ResumeChoice:
+    """Return what the options of `daedalus resume` choose for one run directory."""
+    return ResumeChoice(
+        directory=directory,
+        env_steps=parsed.env_steps,
+        assignments=parsed.set,
+        allowed_modules=frozenset(parsed.allow_module),
+        reset_statistics=parsed.reset_statistics,
+    )
 
 
 def _warn_of_role(directory: Path) -> None:

@@ -7,7 +7,7 @@ import logging
 import time
 from typing import Any, Literal, NamedTuple
 
-from daedalus.gateway.channel import channel_of
+from daedalus.gateway.channel import HELLO_SECONDS, SEND_SECONDS, channel_of
 from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.security import OPERATOR, Guard, RateLimit
 from daedalus.gateway.watching import page_data
@@ -94,8 +94,6 @@ def _decoded(data: str | bytes | None) -> dict[str, Any]:
 
 _logger = logging.getLogger(__name__)
 
-_HELLO_SECONDS = 10.0
-_SEND_SECONDS = 5.0  # for the last message
 _MAX_FAULTS = 5  # of one page; then it is disconnected
 _RATE, _BURST = 2.0, 20.0  # messages of one page a second
 _FAULT, _TRY_LATER = 1008, 1013  # codes of RFC 6455
@@ -155,10 +153,10 @@ class ViewerConnection:
     async def _greet(self) -> str:
         """Return the owner of the page's token."""
         try:
-            async with asyncio.timeout(_HELLO_SECONDS):
+            async with asyncio.timeout(HELLO_SECONDS):
                 message = await self._next()
         except TimeoutError:
-            raise ClientError("malformed", f"no hello came within {_HELLO_SECONDS:g} s") from None
+            raise ClientError("malformed", f"no hello came within {HELLO_SECONDS:g} s") from None
         if not isinstance(message, ViewerHello):
             raise ClientError("out_of_turn", "the first message must be a hello")
         return self._guard.check_viewer(message.token)
@@ -260,7 +258,7 @@ class ViewerConnection:
         code = _TRY_LATER if error.code == "unavailable" else _FAULT
         message = {"type": "error", "code": error.code, "reason": error.reason}
         with contextlib.suppress(TimeoutError, OSError):
-            async with asyncio.timeout(_SEND_SECONDS):
+            async with asyncio.timeout(SEND_SECONDS):
                 await self._send(message)
                 await self._send_event({"type": "websocket.close", "code": code})
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from daedalus.learner.league.ratings import LeagueState, Ratings
 from daedalus.learner.run.counters import RunCounters, check_counters
 from daedalus.learner.run.run_directory import SUMMARY, VERSIONS, read_json
-from daedalus.learner.run.settings import SettingsError, assign, override, run_spec
+from daedalus.learner.run.settings import SettingsError, assign, flat_settings, override, run_spec
 from daedalus.policy.saving.saved_policy import (
     NoPolicyError,
     OtherFormatError,
@@ -113,11 +113,7 @@ def _is_fixed(name: str) -> bool:
 
 
 def _values(spec: RunSpec) -> dict[str, Any]:
-    return {
-        f"{section}.{key}": value
-        for section, values in spec.model_dump(mode="json").items()
-        for key, value in values.items()
-    }
+    return flat_settings(spec.model_dump(mode="json"))
 
 
 def check_initial(directory: Path | None, *, other_spaces: bool = False) -> None:

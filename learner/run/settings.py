@@ -279,13 +279,22 @@ def setting_text(value: object) -> str:
     return shown if len(shown) <= 400 else f"{shown[:400]}..."
 
 
+def flat_settings(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of all sections by `section.key`. What is no section is left out."""
+    return {
+        f"{section}.{key}": value
+        for section, values in sections.items()
+        if isinstance(values, Mapping)
+        for key, value in values.items()
+    }
+
+
 def changed_settings(settings: Mapping[str, Any]) -> list[str]:
     """Return which settings, by `section.key` as JSON has them, differ from the defaults of this release.
 
     The environment's id, which has no default, and settings of another release are among them.
     """
-    known = RunSpec.model_validate({"environment": {"id": "none"}}).model_dump(mode="json")
-    defaults = {f"{section}.{key}": value for section, values in known.items() for key, value in values.items()}
+    defaults = flat_settings(RunSpec.model_validate({"environment": {"id": "none"}}).model_dump(mode="json"))
     del defaults["environment.id"]
     return [path for path, value in settings.items() if path not in defaults or value != defaults[path]]
 
