@@ -56,27 +56,13 @@ def _take(address: str, token: str, folder: Path, seconds: float) -> None:
     sync_api: Any = importlib.import_module("playwright.sync_api")  # an extra
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        desktop = {"width": 1200, "height": 900}
-        pages = {
-            "page_light": browser.new_page(viewport=desktop, color_scheme="light"),
-            "page_dark": browser.new_page(viewport=desktop, color_scheme="dark"),
-            "page_phone": browser.new_page(viewport={"width": 390, "height": 844}, color_scheme="light"),
-        }
-        for page in pages.values():
-            page.goto(address)
-            page.locator("#token").fill(token)
-            page.get_by_role("button", name="Open").click()
-        light = pages["page_light"]
-        light.wait_for_timeout(1000 * seconds)
-        for name, page in pages.items():
-            page.screenshot(path=str(folder / f"{name}.png"))
-            _shrink(folder / f"{name}.png")
-        light.locator("#camera-switch:enabled").click()
-        light.wait_for_selector("#camera-view .bars li:nth-child(2)", timeout=LIMIT)
-        light.wait_for_timeout(2000)
-        light.locator("#camera").scroll_into_view_if_needed()
-        light.locator("#camera").screenshot(path=str(folder / "page_camera.png"))
-        _shrink(folder / "page_camera.png")
+        page = browser.new_page(viewport={"width": 1200, "height": 900}, color_scheme="light")
+        page.goto(address)
+        page.locator("#token").fill(token)
+        page.get_by_role("button", name="Open").click()
+        page.wait_for_timeout(1000 * seconds)
+        page.screenshot(path=str(folder / "page_light.png"))
+        _shrink(folder / "page_light.png")
         browser.close()
 
 

@@ -13,11 +13,12 @@ import itertools
 import math
 import multiprocessing
 import time
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +26,11 @@ from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import machine, table
 from benchmarks.study.tasks import TASKS, VARIANTS, specification
 from daedalus.analysis.comparison import estimate, improvement, written
+from daedalus.protocol.messages import Snapshot
+from daedalus.protocol.spec import RunSpec
+
+if TYPE_CHECKING:
+    from benchmarks.study.one_process import LocalLearner
 
 _IDENTITY = ("task", "variant", "lag", "seed", "budget")
 _RESULTS = ("env_steps", "final_return", "env_steps_to_threshold", "lag_mean", "seconds")
@@ -43,12 +49,11 @@ class Cell:
 
 def run(cell: Cell) -> dict[str, Any]:
     """Make a run; return its line of the file."""
-    from benchmarks.study.exact_lag import train
     from daedalus.learner.run.process_resources import keep_freed_memory
 
     keep_freed_memory()
     began = time.monotonic()
-    learner = train(specification(cell.task, cell.variant, cell.seed, cell.budget), cell.lag)
+    learner = _train(specification(cell.task, cell.variant, cell.seed, cell.budget), cell.lag)
     counters = learner.counters
     return {
         **asdict(cell),
@@ -58,6 +63,30 @@ def run(cell: Cell) -> dict[str, Any]:
         "lag_mean": f"{counters.policy_lag_mean:.4g}",
         "seconds": f"{time.monotonic() - began:.1f}",
     }
+
+
+def _train(spec: RunSpec, lag: int) -> "LocalLearner":
+    """Train with one rollout for each batch, until the end of the run; return the learner.
+
+    Args:
+      spec: settings of the run.
+      lag: updates by which snapshots arrive late. Where a batch makes several updates, snapshots are at least so late.
+    """
+    from benchmarks.study.one_process import LocalActor, LocalLearner
+
+    actor = LocalActor(spec, "actor-0")
+    try:
+        learner = LocalLearner(spec, actor.spaces)
+        actor.begin(learner.program, spec.training.seed)
+        snapshots: deque[Snapshot] = deque()
+        while not learner.ended:
+            snapshots.append(learner.snapshot())
+            while len(snapshots) > 1 and snapshots[1].policy_version <= learner.policy_version - lag:
+                snapshots.popleft()
+            learner.train(actor.play(snapshots[0]))
+    finally:
+        actor.close()
+    return learner
 
 
 def cell(line: Mapping[str, str]) -> Cell:
