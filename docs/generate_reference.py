@@ -31,7 +31,7 @@ PYTHON_API = {
         *("load_policy", "Policy", "Decisions", "NoPolicyError", "DamagedError"),
         *("EnvironmentSetupError", "ExportError", "HubError", "VideoError"),
     ),
-    "Client": ("Client", "daedalus.actor.collecting.client_agent.ClientAgent"),
+    "Client": ("Client", "daedalus.actor.collecting.client_collector.ClientAgent"),
     "Transport": tuple(f"daedalus.transport.interface.{name}" for name in ("Transport", "Request", "Inbox")),
     "Metrics": tuple(f"daedalus.learner.reporting.metrics_rows.{name}" for name in ("MetricsWriter", "Details")),
 }

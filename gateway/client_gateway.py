@@ -3,7 +3,7 @@
 event loop        clients' messages, actions, rollouts: this file, connection.py, batcher.py, client_uploads.py
 link thread       finds the learner, loads snapshots: learner_link.py
 join threads      requests to join, which may wait: joining.py
-presence thread   declares which clients are present: presence.py
+presence thread   declares which clients are present: joining.py
 sender thread     sends the rollouts: client_uploads.py
 """
 

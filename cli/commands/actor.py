@@ -15,8 +15,7 @@ from daedalus.cli.arguments import (
     log_options,
     seconds,
 )
-from daedalus.launch.actor_group import ActorGroup
-from daedalus.launch.actor_process import ActorOptions, LeaveRequest, run_actor
+from daedalus.launch.actor_process import ActorGroup, ActorOptions, LeaveRequest, run_actor
 from daedalus.launch.logs import print_error
 from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daedalus.learner.reporting.bottleneck import bottleneck
 from daedalus.learner.reporting.csv_writer import cut_rows
-from daedalus.learner.reporting.learning_hints import EpisodeHint, LearningHint, ObservationHint
+from daedalus.learner.reporting.hints import EpisodeHint, LearningHint, ObservationHint, bottleneck
 from daedalus.learner.reporting.metrics_rows import ENV, LESSON, Details, league_columns, read_rows
 from daedalus.learner.reporting.rates import RateMeter
 from daedalus.learner.reporting.recorder import Recorder

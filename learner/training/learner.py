@@ -29,10 +29,9 @@ from daedalus.algorithms.replay_buffer import ReplayBuffer
 from daedalus.learner.run.counters import updates_of
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.training.demonstrations import Cloning
-from daedalus.learner.training.optimizers import build_optimizer
+from daedalus.learner.training.optimizers import UpdateStep, build_optimizer
 from daedalus.learner.training.update_graphs import UpdateGraphs, check_device, memory_faults
 from daedalus.learner.training.update_metrics import UpdateMetrics
-from daedalus.learner.training.update_step import UpdateStep
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.exploration import ANNEALING

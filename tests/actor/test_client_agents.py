@@ -8,8 +8,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 from test_client_collector import IDENTITY, ROWS, Played, Robot, run_spec, synchronous, take
 
-from daedalus.actor.collecting.client_agent import ClientAgent
-from daedalus.actor.collecting.client_collector import ClientCollector
+from daedalus.actor.collecting.client_collector import ClientAgent, ClientCollector
 from daedalus.learner.serving.rollout_judge import episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime

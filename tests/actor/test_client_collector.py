@@ -12,8 +12,7 @@ import torch
 from allowed_modules import TEST_MODULES
 from collectors import started_collector
 
-from daedalus.actor.collecting.client_collector import ClientCollector
-from daedalus.actor.collecting.client_exchange import _MAX_FULL_ROLLOUTS
+from daedalus.actor.collecting.client_collector import _MAX_FULL_ROLLOUTS, ClientCollector
 from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.make import make_environments

@@ -1,4 +1,4 @@
-"""`daedalus status` as a person and a program read it: hosts, refused joins, hostile texts."""
+"""`daedalus status` as a person and a program read it: hosts, clients, refused joins, hostile texts."""
 
 import json
 from collections.abc import Callable
@@ -7,6 +7,7 @@ import pytest
 from league_statuses import LEAGUE
 from statuses import actor_status, run_status
 
+from daedalus.cli.commands.status import _client_texts
 from daedalus.cli.commands.status import status as status_command
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -132,3 +133,19 @@ def test_texts_of_peers_cannot_command_the_terminal_or_begin_lines(printed: Prin
     output = printed(run_status(actors=(actor,), refused_joins=(refused,)), *options)
     assert not {"\x1b", "\r", "\x9b"} & set(output)
     assert not any(line.startswith("PROBLEM") for line in output.splitlines())
+
+
+def test_an_actor_that_reports_nothing_has_no_line() -> None:
+    assert _client_texts(actor_status("a")) == []
+
+
+def test_a_client_has_lines_with_its_counts() -> None:
+    client = actor_status(
+        "a", deadlines=1200, missed_deadlines=3, rows=200, overridden_actions=5, safe_actions=40, rollouts_dropped=2
+    )
+    assert _client_texts(client) == [
+        "counts 3 of 1,200 deadlines missed, 5 actions overridden (2.5%), 40 safe actions, 2 rollouts dropped"
+    ]
+    assert _client_texts(actor_status("a", deadlines=1200)) == ["counts 0 of 1,200 deadlines missed"]
+    assert _client_texts(actor_status("a", safe_reason="why")) == ["plays the safe action: why"]
+    assert _client_texts(actor_status("a", safe_reason="why", alive=False)) == []

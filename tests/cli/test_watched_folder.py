@@ -1,11 +1,11 @@
-"""launch/watched_folder.py: what the page shows of a run directory, while the run goes on and at its end."""
+"""WatchedFolder: what the page shows of a run directory, while the run goes on and at its end."""
 
 import json
 from pathlib import Path
 
 from recorded_runs import record
 
-from daedalus.launch.watched_folder import WatchedFolder
+from daedalus.launch.gateway_process import WatchedFolder
 
 SECRET = "pa55w0rd"
 

@@ -1,4 +1,4 @@
-"""learner/reporting/learning_hints.py: a run that does not learn says so, once."""
+"""learner/reporting/hints.py: a run that does not learn says so, once."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from building import make_rollout
 
-from daedalus.learner.reporting.learning_hints import LearningHint, ObservationHint
+from daedalus.learner.reporting.hints import LearningHint, ObservationHint
 from daedalus.protocol.spec import TrainingSpec
 
 

@@ -13,7 +13,7 @@ from league_statuses import LEAGUE
 
 from daedalus.algorithms import curiosity
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
-from daedalus.learner.reporting.learning_hints import EpisodeHint
+from daedalus.learner.reporting.hints import EpisodeHint
 from daedalus.learner.reporting.metrics_rows import COLUMNS, Details
 from daedalus.learner.reporting.rates import Rate, RateMeter, RunRates
 from daedalus.learner.reporting.run_reporter import RunReporter, episode_statistics

@@ -15,9 +15,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.learner.run.settings import DeviceLostError, SettingsError
 from daedalus.learner.training.learner import Learner
+from daedalus.learner.training.optimizers import UpdateStep
 from daedalus.learner.training.update_graphs import driver_faults, memory_faults
 from daedalus.learner.training.update_metrics import UpdateMetrics
-from daedalus.learner.training.update_step import UpdateStep
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout
