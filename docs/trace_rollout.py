@@ -1,9 +1,9 @@
 """Trace which of our files a rollout passes, and write them into docs/architecture.md. `make docs-reference` runs this.
 
 A learner and an actor train in one process, over the transport in memory. The functions that count are those that one
-of three threads enters for at least every second rollout: waiting, logging and all else that goes by the clock is left
-out, so that the trace is the same on every machine. With --check nothing is written: small differences pass, because a
-moved function is no reason to change a page.
+of three threads enters during at least every second rollout: waiting, logging and all else that goes by the clock is
+left out, so that the trace is the same on every machine. With --check nothing is written: small differences pass,
+because a moved function is no reason to change a page.
 """
 
 import argparse
@@ -55,7 +55,10 @@ class Tracer:
     def __init__(self) -> None:
         self._recording = False
         self._steps = 0
-        self._calls: dict[int, collections.Counter[Function]] = collections.defaultdict(collections.Counter)
+        # By thread: the rollouts during which a function is entered. A row of metrics calls some of them many times.
+        self._rollouts: dict[int, dict[Function, set[int]]] = collections.defaultdict(
+            lambda: collections.defaultdict(set)
+        )
         self._places: dict[int, dict[Function, tuple[int, ...]]] = collections.defaultdict(dict)
         self._around: dict[int, list[FrameType]] = {}  # the frames of each thread when recording begins
         self._threads: dict[int, str] = {}
@@ -77,21 +80,21 @@ class Tracer:
             for thread, frame in sys._current_frames().items():
                 for each in _callers(frame):
                     if each in self._around.get(thread, []) and (function := _ours(each)):
-                        self._calls[thread][function] += len(_ROLLOUTS)
                         self._count(thread, function, each)
+                        self._rollouts[thread][function] |= {*_ROLLOUTS}
         self._recording = recording
 
     def passed(self) -> dict[str, list[Function]]:
-        """Return the functions that each thread entered for every rollout, in the order of the lines that call them."""
+        """Return the functions that each thread entered for rollouts, in the order of the lines that call them."""
         found: dict[str, list[Function]] = {name: [] for name in THREADS}
-        for thread, calls in self._calls.items():
+        for thread, rollouts in self._rollouts.items():
             if (name := self._threads.get(thread, "")) in found:
-                often = [function for function, number in calls.items() if number >= len(_ROLLOUTS) // 2]
+                often = [function for function, numbers in rollouts.items() if 2 * len(numbers) >= len(_ROLLOUTS)]
                 found[name] = sorted(often, key=self._places[thread].__getitem__)
         return found
 
     def _count(self, thread: int, function: Function, frame: FrameType) -> None:
-        self._calls[thread][function] += 1
+        self._rollouts[thread][function].add(self._steps // (_ROWS * _ENVIRONMENTS))
         place = tuple(each.f_lineno for each in _callers(frame.f_back))[::-1]
         self._places[thread][function] = min(place, self._places[thread].get(function, place))
 
