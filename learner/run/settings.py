@@ -280,7 +280,7 @@ def setting_text(value: object) -> str:
 
 
 def flat_settings(sections: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of all sections by `section.key`. What is no section is left out."""
+    """Return the settings of all sections by `section.key`, without values that are in no section."""
     return {
         f"{section}.{key}": value
         for section, values in sections.items()
