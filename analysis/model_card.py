@@ -16,7 +16,7 @@ from daedalus.learner.run.settings import setting_text
 from daedalus.policy.saving.hub import LIBRARY
 from daedalus.policy.user_modules import allow_words, modules_of
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.texts import one_line
+from daedalus.protocol.texts import one_line, short_share
 
 _TASK = "reinforcement-learning"
 _SHOWN_SECTIONS = ("environment", "policy", "collection", "training")
@@ -144,7 +144,7 @@ def _training(record: RunRecord, spec: RunSpec) -> str:
             if rating is None
             else [("rating in its league", f"{rating:,.0f} ± {record.number(DEVIATION) or 0.0:,.0f}")]
         ),
-        *((f"win rate against {name}", f"{rate:.0%}") for name, rate in rates.items()),
+        *((f"win rate against {name}", short_share(rate)) for name, rate in rates.items()),
         ("env_steps", written(record.number("env_steps"))),
         ("updates", written(record.number("updates"))),
         ("minutes", "-" if seconds is None else f"{seconds / 60.0:.1f}"),

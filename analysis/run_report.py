@@ -34,7 +34,7 @@ from daedalus.learner.run.run_directory import CONFIG
 from daedalus.learner.run.settings import changed_settings, setting_text, value_text
 from daedalus.learner.serving.events import DRAINED_BY, ORDERED_BY, STOPPED_BY
 from daedalus.protocol.league import NEWEST, LeagueStatus, Score
-from daedalus.protocol.texts import printable
+from daedalus.protocol.texts import printable, short_share
 
 _STYLE = Path(__file__).with_name("report_style.css")
 # The browser itself enforces that the page loads nothing from elsewhere and runs no script.
@@ -503,7 +503,7 @@ def league_section(group: Group[RunRecord], by: str) -> ET.Element | None:
             each.player,
             each.text.replace("+-", "±"),
             f"{each.matches:,}",
-            f"{scores[each.player].win_rate:.0%}" if each.player in scores else "-",
+            short_share(scores[each.player].win_rate) if each.player in scores else "-",
         )
         for each in sorted(league.players, key=lambda each: -each.rating)
     ]
@@ -540,10 +540,10 @@ def _win_rate(score: Score | None) -> Child:
     results = f"{score.wins:.4g} won, {score.draws:.4g} drawn, {score.losses:.4g} lost"
     return element(
         "span",
-        f"{100 * rate:.0f}",
+        short_share(rate).removesuffix("%"),
         class_="wins" if rate >= 0.5 else "loses",
         style=f"--share: {_STRONGEST * abs(2 * rate - 1):.0f}%",
-        title=f"{score.first} against {score.second}: {rate:.0%} of {score.matches:.4g} matches ({results})",
+        title=f"{score.first} against {score.second}: {short_share(rate)} of {score.matches:.4g} matches ({results})",
     )
 
 

@@ -14,7 +14,7 @@ from rich.text import Text
 from daedalus.cli.run_watcher import WatchedRun
 from daedalus.learner.reporting.progress import duration
 from daedalus.protocol.messages import ActorStatus, RunStatus
-from daedalus.protocol.texts import one_line, policy_lag, short_number, short_rate
+from daedalus.protocol.texts import one_line, policy_lag, short_number, short_rate, short_share
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 
@@ -71,7 +71,7 @@ def _run(run: WatchedRun, width: int, lines: int, ascii_only: bool) -> list[Rend
     notes += [_line([status.bottleneck], width)] if status.bottleneck else []
     lessons = [f"{name} {text}" for name, text in status.lessons.items()]
     notes += [_line(["lessons:", *lessons], width)] if lessons else []
-    rates = [f"{name} {rate:.0%}" for name, rate in status.league.win_rates.items()] if status.league else []
+    rates = [f"{name} {short_share(rate)}" for name, rate in status.league.win_rates.items()] if status.league else []
     notes += [_line(["newest wins against", *rates], width)] if rates else []
     lines = max(lines - len(notes), 0)
     shown = status.actors[:lines]

@@ -131,6 +131,13 @@ def short_rate(value: float) -> str:
     return f"{value:,.0f}" if value >= 9.95 else f"{value:.2g}"
 
 
+def short_share(value: float) -> str:
+    """Return a share as a whole percentage that is 0% or 100% only of none or all: 97%, <1%, >99%."""
+    if 0.0 < value < 0.005:
+        return "<1%"
+    return ">99%" if 0.995 <= value < 1.0 else f"{value:.0%}"
+
+
 def short_duration(seconds: float) -> str:
     """Return a duration with two digits that count, or more: 102 s, 1.5 s, 305 ms or 0.42 ms."""
     if seconds >= 9.95:

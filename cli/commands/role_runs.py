@@ -117,9 +117,15 @@ def _created(
     with run_directory.made(parent):
         try:
             for role, own in agents.items():
+                choice = replace(new.choice, assignments=(*new.choice.assignments, *changes[role]))
+                given = choice.spec()
+                if given.environment.agents or given.league.sides:
+                    raise SettingsError(
+                        "environment.agents and league.sides follow from the roles of this game: leave them out"
+                    )
                 # All on one side: they have no opponent in their own run.
                 fixed = [f"environment.agents={list(own)}", *([f"league.sides=[{list(own)}]"] if len(own) > 1 else [])]
-                choice = replace(new.choice, assignments=(*new.choice.assignments, *changes[role], *fixed))
+                choice = replace(choice, assignments=(*choice.assignments, *fixed))
                 lock, spec, spaces = create_run(
                     replace(new, choice=choice, directory=run_directory.role_directory(parent, role)), fork=True
                 )

@@ -23,7 +23,15 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.league import NEWEST, LeagueStatus
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
-from daedalus.protocol.texts import one_line, policy_lag, printable, short_duration, short_number, short_rate
+from daedalus.protocol.texts import (
+    one_line,
+    policy_lag,
+    printable,
+    short_duration,
+    short_number,
+    short_rate,
+    short_share,
+)
 from daedalus.transport.certificate_expiry import WARNING_DAYS
 from daedalus.transport.connecting import connect_once
 from daedalus.transport.credentials import SECURITY_ERRORS, Credentials, credentials_to_connect, run_for
@@ -322,7 +330,7 @@ def _league_table(league: LeagueStatus) -> list[str]:
     first = sorted(by_rating, key=lambda each: each.player not in named)[:_MOST_PLAYERS]
     scores, rows = league.scores_of(NEWEST), [["player", "rating", "+-", "matches", "newest wins"]]
     for each in (player for player in by_rating if player in first):
-        wins = f"{scores[each.player].win_rate:.0%}" if each.player in scores else "-"
+        wins = short_share(scores[each.player].win_rate) if each.player in scores else "-"
         numbers = f"{round(each.rating):,}", f"{round(each.deviation):,}", f"{each.matches:,}"
         rows.append([one_line(each.player)[:_LONGEST_PLAYER], *numbers, wins])
     more = len(by_rating) - len(first) + league.left_out

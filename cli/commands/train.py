@@ -59,7 +59,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
 from daedalus.protocol.league import LeagueStatus
-from daedalus.protocol.texts import printable, short_number
+from daedalus.protocol.texts import printable, short_number, short_share
 from daedalus.transport.credentials import SECURITY_ERRORS, credentials_to_listen
 
 _logger = logging.getLogger(__name__)
@@ -413,7 +413,7 @@ def _rated(summary: dict[str, Any]) -> list[str]:
     league = LeagueStatus() if summary.get("league") is None else LeagueStatus.model_validate(summary["league"])
     if league.newest is None:
         return []
-    wins = ", ".join(f"{rate:.0%} against {name}" for name, rate in league.win_rates.items())
+    wins = ", ".join(f"{short_share(rate)} against {name}" for name, rate in league.win_rates.items())
     rating = f"league: rating {league.newest.text} of the newest policy"
     return [printable(f"{rating}; wins {wins}" if wins else rating)]
 

@@ -28,8 +28,10 @@ export function duration(seconds) {
   return `${(seconds / 3600).toFixed(1)} h`;
 }
 
-/** Return a share from 0 to 1 in percent. */
+/** Return a share in whole percent that is 0 or 100 only of none or all, such as a win rate of 0.996. */
 export function percent(share) {
+  if (share > 0 && share < 0.005) return "<1 %";
+  if (share >= 0.995 && share < 1) return ">99 %";
   return `${Math.round(100 * share)} %`;
 }
 

@@ -85,7 +85,7 @@ function cell(first, second, score) {
   if (!score) return element("td", { class: "number", title: `${first} and ${second} have not played` }, "-");
   const { wins, draws, losses, matches, rate } = score;
   const title = `${first} against ${second}: ${percent(rate)} of ${number(matches)} matches (${number(wins)} won, ${number(draws)} drawn, ${number(losses)} lost)`;
-  const made = element("td", { class: `number ${rate < 0.5 ? "loses" : "wins"}`, title }, Math.round(100 * rate));
+  const made = element("td", { class: `number ${rate < 0.5 ? "loses" : "wins"}`, title }, percent(rate).replace(" %", ""));
   made.style.setProperty("--share", `${Math.round(2 * STRONGEST * Math.abs(rate - 0.5))}%`);
   return made;
 }

@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import TextIO
 
 from daedalus.learner.reporting.metrics_rows import WIN_RATE
-from daedalus.protocol.texts import policy_lag, short_number, short_rate
+from daedalus.protocol.texts import policy_lag, short_number, short_rate, short_share
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
@@ -94,7 +94,8 @@ def _parts(row: Mapping[str, float], budget: int, updates_per_batch: int) -> lis
     ]
     if "episode_length_mean" in row:
         parts.insert(5, f"length {row['episode_length_mean']:>6,.0f}")
-    rates = [f"{name.removeprefix(WIN_RATE)} {rate:.0%}" for name, rate in row.items() if name.startswith(WIN_RATE)]
+    wins = {name.removeprefix(WIN_RATE): rate for name, rate in row.items() if name.startswith(WIN_RATE)}
+    rates = [f"{name} {short_share(rate)}" for name, rate in wins.items()]
     if rates:
         parts.insert(2, f"wins against {', '.join(rates[:_SHOWN_OPPONENTS])}")
     return parts

@@ -69,8 +69,13 @@ def test_each_role_has_a_run_of_its_own(start: Start, address: str, tmp_path: Pa
     game = ("--env", "chase:Chase", "--set", "environment.backend=pettingzoo")
     runs = {role: tmp_path / f"runs/chase/chase-{role}" for role in ("hunter", "hare")}
     check = start("check", *game)
+    given = start("train", *game, "--run-dir", tmp_path / "given", "--set", "league.sides=[['hunter_0'], ['hunter_1']]")
     assert check.wait() == 1
     check.expect(r"different spaces \(hunter_0, hunter_1; hare_0\).* `daedalus train` starts a learner for each role")
+
+    assert given.wait() == 2
+    given.expect("environment.agents and league.sides follow from the roles of this game: leave them out")
+    assert not (tmp_path / "given").exists()
 
     train = start(
         "train", *game, *OPTIONS, "--run-dir", tmp_path / "runs/chase", "--env-steps", 10**9,

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daedalus.protocol import keys
-from daedalus.protocol.texts import bounded_text, one_line, printable, short_number, without_secrets
+from daedalus.protocol.texts import bounded_text, one_line, printable, short_number, short_share, without_secrets
 
 offline = settings(max_examples=200, deadline=None, derandomize=True)
 
@@ -69,6 +69,13 @@ SHOWN = {0.0: "0", 1.2e-5: "1.2e-05", -0.0345: "-0.0345", 0.98765: "0.988", -475
 @pytest.mark.parametrize(("value", "text"), SHOWN.items())
 def test_numbers_of_any_size_have_three_digits_that_count(value: float, text: str) -> None:
     assert short_number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.0, "0%"), (1e-9, "<1%"), (0.006, "1%"), (0.994, "99%"), (0.996, ">99%"), (1.0, "100%")]
+)
+def test_a_share_is_all_or_nothing_only_if_it_is(share: float, text: str) -> None:
+    assert short_share(share) == text
 
 
 @pytest.mark.parametrize(
