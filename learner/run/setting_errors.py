@@ -167,7 +167,8 @@ def types_of(path: list[str]) -> list[Any]:
     """Return the types that a setting may have besides None; empty if there is no such setting."""
     field = _field(path)
     if field is None:
-        return []
+        table = _field(path[:2]) if len(path) > 2 else None  # such as league.opponents, whose names may have dots
+        return [_bare(get_args(table.annotation)[1])] if table and get_origin(table.annotation) is dict else []
     is_union = get_origin(field.annotation) in (Union, UnionType)
     types = get_args(field.annotation) if is_union else (field.annotation,)
     return [_bare(each) for each in types if each is not NoneType]

@@ -55,6 +55,7 @@ def test_a_list_of_values() -> None:
         ("environment.kwargs.size=-1..1.0", -1, 1, False, False),
         ("training.entropy_bonus=0..1", 0, 1, False, False),
         ("training.target_return=0..1", 0, 1, False, False),
+        ("league.opponents.my_bots:Greedy.v1=0..1", 0, 1, False, False),
     ],
 )
 def test_a_range_is_logarithmic_beyond_a_factor_of_10(
