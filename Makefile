@@ -3,14 +3,18 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-core test-trackio test-compose examples screenshots attack fuzz mutants docs docs-reference check format lock clean
+.PHONY: train test pytest test-core test-trackio test-compose examples screenshots attack fuzz mutants docs docs-reference check ruff pyright format lock clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
 # Five processes share the tests, also on two cores: many tests wait for the processes that they start, and their files
-# come first. The tests of one file run in one process, because they share what they start.
-test: check
+# come first. The tests of one file run in one process, because they share what they start. Beside them pyright checks
+# types, in one thread of its own.
+test: ruff
+	$(MAKE) -j2 pyright pytest
+
+pytest: .venv/ready-test
 	$(BIN)/pytest --numprocesses 5 --dist loadfile --no-loadscope-reorder
 
 # The mathematics, the wire, the learner and runs with real processes, in an environment of their own. With the oldest
@@ -39,9 +43,13 @@ test-trackio: .venv/ready-test
 test-compose: .venv/ready-test
 	$(BIN)/pytest -v -s -rs tests/compose/scenario.py
 
-check: .venv/ready-test
+check: ruff pyright
+
+ruff: .venv/ready-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+pyright: .venv/ready-test
 	$(BIN)/pyright
 
 format: .venv/ready-test
