@@ -42,10 +42,10 @@ def wait_for_training(status: Status, name: str) -> None:
 # --------------------------------------------------------------------------------------------- actors
 
 
-def test_a_frozen_actor_is_noticed_as_gone_nobody_waits_for_it_and_it_continues_afterwards(
-    start: Start, address: str, status: Status, learner: Callable[..., Running]
+def test_a_frozen_actor_is_noticed_continues_and_does_not_hold_the_end_of_its_learner(
+    start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
-    learner("--algorithm", "a2c")  # whose batches have a rollout of each actor
+    serving = learner("--algorithm", "a2c")  # whose batches have a rollout of each actor
     frozen = start("actor", "--connect", address, "--name", "frozen", *PLAYING_SLOW)
     start("actor", "--connect", address, "--name", "other", *PLAYING_SLOW)
     wait_for_training(status, "frozen")
@@ -59,20 +59,65 @@ def test_a_frozen_actor_is_noticed_as_gone_nobody_waits_for_it_and_it_continues_
     again = actor_status(status(), "frozen")
     assert (again["alive"], again["lives"]) == (True, 1)
     assert set(again["rollouts_rejected"]) <= {"stale", "duplicate"}
+    frozen.process.send_signal(signal.SIGSTOP)
+    serving.process.terminate()
+    serving.process.terminate()
+    assert serving.wait() == 0, serving.output
+    assert (tmp_path / "run" / "summary.json").exists()
 
 
-def test_an_actor_continues_without_a_restart_after_its_link_stalled(
+def test_an_actor_continues_after_its_link_stalled_and_arbitrary_bytes_change_nothing(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
-    learner()
+    serving = learner()
     with closing(StallingProxy(address)) as proxy:
-        start("actor", "--connect", proxy.address, "--name", "remote", *PLAYING_SLOW)
+        actor = start("actor", "--connect", proxy.address, "--name", "remote", *PLAYING_SLOW)
         wait_for_training(status, "remote")
         proxy.stall()
         until(lambda: actor_status(status(), "remote").get("alive") is False)
         proxy.resume()
         wait_for_training(status, "remote")
         assert actor_status(status(), "remote")["lives"] == 1
+        with closing(Sender(address, "stranger")) as sender:
+            send_arbitrary_bytes(sender, status()["run"], "remote")
+            wait_for_training(status, "remote")
+        after = status()
+        assert {"remote", "stranger"} == {each["actor"] for each in after["actors"]}
+        assert after["rollouts_rejected"]["malformed"] > 0
+        assert after["rollouts_rejected"]["unknown_actor"] > 0
+        for process in (serving, actor):
+            assert process.process.poll() is None
+            assert "Traceback" not in process.output
+
+
+def send_arbitrary_bytes(sender: Sender, run: str, actor: str) -> None:
+    """Send noise, and parts of a genuine rollout, on all keys of a run, also on those of one of its actors."""
+    genuine = sender.rollout(0, 0)
+    noise = random.Random(1)
+    for attempt in range(60):
+        kind = attempt % 4
+        if kind == 0:
+            payload = noise.randbytes(noise.randrange(200))
+        elif kind == 1:
+            payload = genuine[: noise.randrange(len(genuine))]
+        else:
+            damaged = bytearray(genuine)
+            for _ in range(kind):
+                damaged[noise.randrange(len(damaged))] = noise.randrange(256)
+            payload = bytes(damaged)
+        for key in (
+            keys.join(run, "stranger"),
+            keys.program(run, "0" * 64),
+            keys.rollouts(run, actor),
+            keys.rollouts(run, "stranger"),
+            keys.rollouts(run, "nobody"),
+            keys.evaluations(run, "e"),
+            keys.snapshots(run),
+            keys.status(run),
+        ):
+            assert len(sender.transport.query(key, payload, timeout=LIMIT)) == 1
+        sender.transport.publish(keys.snapshots(run), payload)
+    sender.transport.declare_presence(keys.presence(run, "nobody-ever-joined", 1))
 
 
 def test_an_actor_that_sends_nan_rewards_is_quarantined_and_prints_the_reason(
@@ -110,7 +155,7 @@ def newest_checkpoint(directory: Path) -> str:
     return max((entry.name for entry in (directory / "checkpoints").glob("0*")), default="")
 
 
-def test_the_same_command_with_resume_continues_a_killed_learner(
+def test_the_same_command_continues_a_killed_learner_which_trains_while_the_disk_is_full(
     start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     first = learner("--resume", *SAVING)
@@ -124,22 +169,30 @@ def test_the_same_command_with_resume_continues_a_killed_learner(
     assert version > 0
     wait_for_training(status, "loyal")
     assert status()["updates"] > version
+    expect_training_without_checkpoints(second, start, address, tmp_path / "run", status)
     other = learner("--resume", "--seed", 99)
     assert other.wait() == 2
     assert "has other settings" in other.output
 
 
-def test_a_learner_writes_its_summary_on_sigterm_although_an_actor_is_frozen(
-    start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
+def expect_training_without_checkpoints(
+    serving: Running, start: Start, address: str, run: Path, status: Status
 ) -> None:
-    leaving = learner()
-    frozen = start("actor", "--connect", address, "--name", "frozen", *PLAYING_SLOW)
-    wait_for_training(status, "frozen")
-    frozen.process.send_signal(signal.SIGSTOP)
-    leaving.process.terminate()
-    leaving.process.terminate()
-    assert leaving.wait() == 0
-    assert (tmp_path / "run" / "summary.json").exists()
+    """Let no file be written for a while: the learner trains on, and warns."""
+    until(lambda: status().get("checkpoint_age_seconds") is not None)
+    _, hard = resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE, (0, hard))
+    serving.expect("checkpoint not saved")
+    assert start("status", "--connect", address, "--quiet").wait() == 3
+    assert "checkpoints cannot be saved: File too large" in status()["problems"]
+    newest = newest_checkpoint(run)
+    wait_for_training(status, "loyal")
+    assert newest_checkpoint(run) == newest
+    resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
+    serving.expect("checkpoints are saved again")
+    until(lambda: newest_checkpoint(run) > newest)
+    assert serving.output.count("checkpoint not saved") == 1
+    until(lambda: status().get("problems") == [])
 
 
 # ---------------------------------------------------------------------------------- router and network
@@ -157,85 +210,29 @@ def router(start: Start, address: str) -> Callable[[], Running]:
     return start_one
 
 
-def test_learner_and_actors_reconnect_when_the_router_is_restarted(
+def test_learner_and_actors_reconnect_after_a_restart_of_the_router_and_a_stalled_link(
     start: Start, address: str, status: Status, router: Callable[[], Running]
 ) -> None:
-    serving = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS, *SLOW)
-    serving.expect("waiting for it")
-    first = router()
-    actor = start("actor", "--connect", address, "--name", "loyal", *PLAYING_SLOW)
-    wait_for_training(status, "loyal")
-    first.process.kill()
-    first.wait()
-    assert status() == {}
-    router()
-    wait_for_training(status, "loyal")
-    assert actor_status(status(), "loyal")["lives"] == 1
-    assert (serving.process.poll(), actor.process.poll()) == (None, None)
-
-
-def test_a_learner_serves_again_after_its_link_to_the_router_stalled(
-    start: Start, address: str, status: Status, router: Callable[[], Running]
-) -> None:
-    router()
     with closing(StallingProxy(address)) as proxy:
-        start("learner", "cartpole", "--connect", proxy.address, "--run-dir", "run", *ENDLESS, *SLOW)
-        start("actor", "--connect", address, "--name", "loyal", *PLAYING_SLOW)
+        serving = start("learner", "cartpole", "--connect", proxy.address, "--run-dir", "run", *ENDLESS, *SLOW)
+        serving.expect("waiting for it")
+        first = router()
+        actor = start("actor", "--connect", address, "--name", "loyal", *PLAYING_SLOW)
+        wait_for_training(status, "loyal")
+        first.process.kill()
+        first.wait()
+        assert status() == {}
+        router()
         wait_for_training(status, "loyal")
         proxy.stall()
         until(lambda: status() == {})
         proxy.resume()
         wait_for_training(status, "loyal")
+        assert actor_status(status(), "loyal")["lives"] == 1
+        assert (serving.process.poll(), actor.process.poll()) == (None, None)
 
 
 # ------------------------------------------------------------------------------- hostile senders
-
-
-def test_arbitrary_bytes_on_any_key_change_nothing(
-    start: Start, address: str, status: Status, learner: Callable[..., Running]
-) -> None:
-    serving = learner()
-    actor = start("actor", "--connect", address, "--name", "good", *PLAYING_SLOW)
-    wait_for_training(status, "good")
-    run = status()["run"]
-    sender = Sender(address, "stranger")
-    genuine = sender.rollout(0, 0)
-    noise = random.Random(1)
-    try:
-        for attempt in range(60):
-            kind = attempt % 4
-            if kind == 0:
-                payload = noise.randbytes(noise.randrange(200))
-            elif kind == 1:
-                payload = genuine[: noise.randrange(len(genuine))]
-            else:
-                damaged = bytearray(genuine)
-                for _ in range(kind):
-                    damaged[noise.randrange(len(damaged))] = noise.randrange(256)
-                payload = bytes(damaged)
-            for key in (
-                keys.join(run, "stranger"),
-                keys.program(run, "0" * 64),
-                keys.rollouts(run, "good"),
-                keys.rollouts(run, "stranger"),
-                keys.rollouts(run, "nobody"),
-                keys.evaluations(run, "e"),
-                keys.snapshots(run),
-                keys.status(run),
-            ):
-                assert len(sender.transport.query(key, payload, timeout=LIMIT)) == 1
-            sender.transport.publish(keys.snapshots(run), payload)
-        sender.transport.declare_presence(keys.presence(run, "nobody-ever-joined", 1))
-        wait_for_training(status, "good")
-    finally:
-        sender.close()
-    after = status()
-    assert {"good", "stranger"} == {each["actor"] for each in after["actors"]}
-    assert after["rollouts_rejected"]["malformed"] > 0
-    assert after["rollouts_rejected"]["unknown_actor"] > 0
-    for process in (serving, actor):
-        assert process.process.poll() is None
-        assert "Traceback" not in process.output
 
 
 def test_a_flooded_learner_answers_busy_and_trains_on_every_accepted_rollout(
@@ -264,28 +261,3 @@ def test_a_flooded_learner_answers_busy_and_trains_on_every_accepted_rollout(
         wait_for_training(status, "good")
     finally:
         sender.close()
-
-
-# ----------------------------------------------------------------------------------------------- disk
-
-
-def test_training_continues_with_a_warning_while_no_checkpoint_can_be_saved(
-    start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
-) -> None:
-    serving = learner(*SAVING)
-    start("actor", "--connect", address, "--name", "good", *PLAYING_SLOW)
-    wait_for_training(status, "good")
-    until(lambda: status().get("checkpoint_age_seconds") is not None)
-    _, hard = resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE, (0, hard))
-    serving.expect("checkpoint not saved")
-    assert start("status", "--connect", address, "--quiet").wait() == 3
-    assert "checkpoints cannot be saved: File too large" in status()["problems"]
-    newest = newest_checkpoint(tmp_path / "run")
-    wait_for_training(status, "good")
-    assert newest_checkpoint(tmp_path / "run") == newest
-    resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
-    serving.expect("checkpoints are saved again")
-    until(lambda: newest_checkpoint(tmp_path / "run") > newest)
-    assert serving.output.count("checkpoint not saved") == 1
-    until(lambda: status().get("problems") == [])
