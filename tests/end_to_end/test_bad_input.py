@@ -4,12 +4,14 @@ import re
 import signal
 import subprocess
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from processes import DAEDALUS, LIMIT, Running, until
 
 from daedalus.cli.command_table import COMMANDS
+from daedalus.transport.zenoh_transport import listen
 
 Start = Callable[..., Running]
 
@@ -125,12 +127,11 @@ def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_
 
 
 def test_an_address_in_use_is_reported(start: Start, address: str, tmp_path: Path) -> None:
-    first = start("learner", "cartpole", "--listen", address, "--run-dir", "one")
-    first.expect("actors join with")
-    second = start("learner", "cartpole", "--listen", address, "--run-dir", "two")
-    assert second.wait() == 1
-    second.expect(f"address {address} is already in use")
-    assert not (tmp_path / "two").exists()
+    with closing(listen([address])):
+        learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
+        assert learner.wait() == 1
+    learner.expect(f"address {address} is already in use")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

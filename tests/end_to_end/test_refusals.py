@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from plain import vector_spaces
-from processes import LIMIT, Running, free_address, starting, until
+from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, free_address, starting, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -17,24 +17,31 @@ from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Join, Message, Refusal, Welcome
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.transport.interface import Transport
-from daedalus.transport.zenoh_transport import connect, listen
+from daedalus.transport.zenoh_transport import connect
 
 CARTPOLE = vector_spaces(4, 2)
 Start = Callable[..., Running]
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Transport]:
-    """Transport of a client that is connected to a running learner, which the tests share."""
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a running learner, which the tests share."""
     address = free_address()
     with starting(tmp_path_factory.mktemp("learner")) as start:
-        learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
+        learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS, *SLOW)
         learner.expect("actors join with")
         with closing(connect([address])) as transport:
             # The key that the learner serves last.
             until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))
-            yield transport
-            assert learner.process.poll() is None, learner.output
+        yield address
+        assert learner.process.poll() is None, learner.output
+
+
+@pytest.fixture
+def client(served: str) -> Iterator[Transport]:
+    """Transport of a client that is connected to the learner."""
+    with closing(connect([served])) as transport:
+        yield transport
 
 
 def ask(transport: Transport, key: str, payload: bytes) -> Message:
@@ -67,11 +74,8 @@ def test_a_foreign_join_that_comes_first_does_not_decide_the_spaces(client: Tran
     assert isinstance(ask(client, keys.join("*", "client"), join(spaces=CARTPOLE, environments=2)), Welcome)
 
 
-def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(start: Start, address: str) -> None:
-    slow = ("--set", "environment.kwargs.seconds=0.1", "--set", "collection.envs_per_actor=1")
-    learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run", *slow)
-    learner.expect("actors join with")
-    actor = ("actor", "--connect", address, "--name", "arm", "--allow-module", "slow_environment")
+def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(start: Start, served: str) -> None:
+    actor = ("actor", "--connect", served, "--name", "arm", *PLAYING_SLOW)
     first = start(*actor)
     first.expect("joined run")
     second = start(*actor)
@@ -84,15 +88,10 @@ def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(s
     third.expect("joined run 'run' as 'arm'")
 
 
-def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str) -> None:
-    with closing(listen([address])) as router:
-        first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
-        first.expect("actors join with")
-        until(lambda: router.query(keys.join("run", "client"), timeout=30.0))
-        second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
-        assert second.wait() == 1
-        second.expect("another learner already serves run 'run': stop that learner, or rename this run")
-        assert first.process.poll() is None
+def test_a_second_learner_of_the_same_run_is_refused(start: Start, served: str) -> None:
+    second = start("learner", "cartpole", "--connect", served, "--run-dir", "two/run")
+    assert second.wait() == 1
+    second.expect("another learner already serves run 'run': stop that learner, or rename this run")
 
 
 def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_the_reason(
@@ -107,8 +106,7 @@ def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_th
         until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))
         other = CARTPOLE.model_copy(update={"actions": {"action": DiscreteSpace(counts=(3,))}})
         assert isinstance(ask(transport, keys.join("run", "client"), join(spaces=other, environments=2)), Welcome)
-        options = "--connect", address, "--allow-module", "slow_environment"
-        actor = start("actor", *options, directory=Path(__file__).parent.parent)
+        actor = start("actor", "--connect", address, *PLAYING_SLOW, directory=Path(__file__).parent.parent)
         assert actor.wait() == 1
         actor.expect("refused.*2 choices.*but this run has.*3 choices")
         status = start("status", "--connect", address, "--run", "run")
