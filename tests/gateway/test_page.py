@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from browser import AXE, Visit, chromium, in_both_schemes
 from certificates import make_certificates
 from gateways import RunningGateway
 from league_statuses import LEAGUE
-from processes import LIMIT, Running, starting, until
+from processes import ENDLESS, LIMIT, Running, processes_mentioning, starting, until
 from scripted_learner import SPEC, ScriptedLearner, acknowledge
 from watched import HOSTILE, actor_status, observed, run_status
 
@@ -36,7 +36,6 @@ FOLDER = FolderView(
     settings=(("environment.id", HOSTILE, True), ("training.discount_factor", "0.99", False)), output=HOSTILE
 )
 TOKEN = "an operator's token of some length"
-ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 Open = Callable[..., Visit]
 
 
@@ -103,6 +102,18 @@ class Run:
         self.address = found[1]
         self.token = (Path(os.readlink(f"/proc/{process.process.pid}/cwd")) / "run/operator-token").read_text().strip()
 
+    @contextmanager
+    def still(self) -> Iterator[None]:
+        """Stop the run's own actor for a while: its endless steps would take a processor."""
+        actors = {*processes_mentioning(self.learner)} & {*processes_mentioning("actor-0")}
+        for pid in actors:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            for pid in actors:
+                os.kill(pid, signal.SIGCONT)
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[tuple[Run, Callable[..., Running]]]:
@@ -144,7 +155,7 @@ def test_three_pages_that_play_are_three_actors_that_the_run_learns_from(
         page.locator("#fast").check()
     names = {page.locator("#name").input_value() for page in pages}
     assert len(names) == 3
-    with closing(connect([run[0].learner])) as transport:
+    with run[0].still(), closing(connect([run[0].learner])) as transport:
         until(lambda: names <= {one.actor for status in ask(transport) for one in status.actors if one.env_steps > 0})
         played = [one for one in ask(transport)[0].actors if one.actor in names]
         assert not {cause for one in played for cause in one.rollouts_rejected} - {"stale"}
@@ -153,8 +164,9 @@ def test_three_pages_that_play_are_three_actors_that_the_run_learns_from(
 
 def test_an_episode_is_shown_on_request(run: tuple[Run, Callable[..., Running]], visit: Open) -> None:
     page = enter(visit(run[0].address).page, run[0].token)
-    page.locator("#camera-switch:enabled").click()
-    page.wait_for_selector("#camera-view .bars li:nth-child(2)", timeout=MILLISECONDS)
+    with run[0].still():
+        page.locator("#camera-switch:enabled").click()
+        page.wait_for_selector("#camera-view .bars li:nth-child(2)", timeout=MILLISECONDS)
     assert page.locator("#camera-view canvas").evaluate("canvas => canvas.width") > 300
     page.locator("#camera-switch").click()
     assert page.locator("#camera-view").is_hidden()
@@ -193,31 +205,38 @@ def test_a_person_plays_tic_tac_toe_against_the_newest_policy(tmp_path: Path, br
         page.get_by_role("link", name="Play against the policy").click()
         enter(page, watched.token)
         page.get_by_role("button", name="Begin a match").click()
-        for agent in ("player_1", "player_2"):
-            wait_for(page, f"/Your turn, {agent}/.test(document.querySelector('#status').textContent)")
-            assert page.locator("#board button").count() == 9
-            played = 0
-            while page.locator("#board [aria-disabled=false]").count():
-                cell = page.locator("#board [aria-disabled=false]").first
-                if played:
-                    cell.click()
-                else:  # by the keyboard alone
-                    cell.focus()
-                    page.keyboard.press("Enter")
-                played += 1
-                mine = f"document.querySelectorAll('[data-mark=you]').length === {played}"
-                wait_for(page, mine)
-                assert page.locator("#board [aria-label*=', you']").count() == played
-            counts = [page.locator(f"[data-mark={owner}]").count() for owner in ("you", "policy")]
-            assert counts[0] - counts[1] in ((0, 1) if agent == "player_1" else (0, -1))
-            outcome = re.search("(You won|You lost|A draw): your return is (-?1|0), that of", text_of(page, "#status"))
-            assert outcome, text_of(page, "#status")
-            assert {"1": "You won", "-1": "You lost", "0": "A draw"}[outcome[2]] == outcome[1]
-            if AXE.exists():
-                assert visited.violations() == []
-            page.locator("#agent").select_option("player_2")
-            page.get_by_role("button", name="Play again").click()
+        wait_for(page, "/Your turn/.test(document.querySelector('#status').textContent)")
+        with watched.still():
+            play_twice(page, visited)
         assert watched.process.process.poll() is None
+
+
+def play_twice(page: Any, visited: Visit) -> None:
+    """Play a match as each player, and check what the page says of it."""
+    for agent in ("player_1", "player_2"):
+        wait_for(page, f"/Your turn, {agent}/.test(document.querySelector('#status').textContent)")
+        assert page.locator("#board button").count() == 9
+        played = 0
+        while page.locator("#board [aria-disabled=false]").count():
+            cell = page.locator("#board [aria-disabled=false]").first
+            if played:
+                cell.click()
+            else:  # by the keyboard alone
+                cell.focus()
+                page.keyboard.press("Enter")
+            played += 1
+            mine = f"document.querySelectorAll('[data-mark=you]').length === {played}"
+            wait_for(page, mine)
+            assert page.locator("#board [aria-label*=', you']").count() == played
+        counts = [page.locator(f"[data-mark={owner}]").count() for owner in ("you", "policy")]
+        assert counts[0] - counts[1] in ((0, 1) if agent == "player_1" else (0, -1))
+        outcome = re.search("(You won|You lost|A draw): your return is (-?1|0), that of", text_of(page, "#status"))
+        assert outcome, text_of(page, "#status")
+        assert {"1": "You won", "-1": "You lost", "0": "A draw"}[outcome[2]] == outcome[1]
+        if AXE.exists():
+            assert visited.violations() == []
+        page.locator("#agent").select_option("player_2")
+        page.get_by_role("button", name="Play again").click()
 
 
 # --------------------------------------------------------------------------------------- runs made for the page
