@@ -1,28 +1,30 @@
 """Actors on a slow link, and with slow environments."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 
 import pytest
 from faults import SlowProxy
-from learner_status import actor_status, learner_status
-from processes import ENDLESS, PLAYING_SLOW, Running, until
+from learner_status import actor_status, env_steps, learner_status
+from processes import ENDLESS, PLAYING_SLOW, Running, free_address, starting, until
 
 Start = Callable[..., Running]
 
 
-@pytest.fixture
-def far(start: Start, address: str) -> Callable[[], dict]:
-    """Start a learner with an endless run; return a function for the status of the actor `far`."""
-    start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a learner with an endless run."""
+    address = free_address()
+    with starting(tmp_path_factory.mktemp("learner")) as start:
+        start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
+        yield address
 
-    return lambda: actor_status(learner_status(address), "far")
 
+def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(start: Start, served: str) -> None:
+    def far() -> dict:
+        return actor_status(learner_status(served), "far")
 
-def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
-    start: Start, address: str, far: Callable[[], dict]
-) -> None:
-    with closing(SlowProxy(address, up=125e3, down=500e3, delay=0.1)) as proxy:
+    with closing(SlowProxy(served, up=125e3, down=500e3, delay=0.1)) as proxy:
         actor = start("actor", "--connect", proxy.address, "--name", "far")
         actor.expect("slow link: .* fetching compact snapshots")
         until(lambda: far().get("rollouts_accepted", 0) > 20)
@@ -33,13 +35,11 @@ def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
         until(lambda: 0 < far().get("bytes_down_per_hour", 0) < 3600 * 500e3)
 
 
-def test_an_actor_with_link_wan_keeps_receiving_new_weights(
-    start: Start, address: str, far: Callable[[], dict]
-) -> None:
-    start("actor", "--connect", address, "--name", "far", "--link", "wan")
-    until(lambda: far().get("env_steps", 0) > 50_000)
+def test_an_actor_with_link_wan_keeps_receiving_new_weights(start: Start, served: str) -> None:
+    start("actor", "--connect", served, "--name", "wan", "--link", "wan")
+    until(lambda: env_steps(learner_status(served), "wan") > 50_000)
     # The actor received new weights: rollouts of its first weights would be stale by now.
-    report = far()
+    report = actor_status(learner_status(served), "wan")
     assert report["compact_snapshots"]
     assert sum(report["rollouts_rejected"].values()) < report["rollouts_accepted"]
 
