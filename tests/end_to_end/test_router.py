@@ -32,16 +32,6 @@ def test_a_router_prints_its_address_and_ends_on_sigterm(start: Start, address: 
     assert len(router.lines) == 1
 
 
-def test_a_run_works_over_two_routers_that_start_in_any_order(start: Start, address: str, other_address: str) -> None:
-    second = start("router", "--listen", other_address, "--connect", address)
-    second.expect(f"nothing answers at {address}: .*; trying again")
-    learner = start("learner", "cartpole", "--connect", other_address, "--run-dir", "run", "--env-steps", 8000)
-    start("actor", "--connect", address)
-    start("router", "--listen", address)
-    assert learner.wait() == 3, learner.output
-    second.expect(f"connected to {address}")
-
-
 def test_a_learner_that_waits_for_a_router_is_alive_and_leaves_no_directory(
     start: Start, address: str, tmp_path: Path
 ) -> None:
@@ -99,12 +89,18 @@ def scrape(url: str) -> dict[tuple[str, str], float]:
         return {(each.name, each.labels.get("actor", "")): each.value for family in families for each in family.samples}
 
 
-def test_the_exporter_serves_metrics_of_the_present_learner_and_actors_only(start: Start, address: str) -> None:
+def test_a_run_works_over_two_routers_and_the_exporter_serves_metrics_of_present_processes_only(
+    start: Start, address: str, other_address: str
+) -> None:
+    """The routers start in any order; actors and exporter are at the one, the learner at the other."""
     exporter = start("exporter", "--connect", address, "--listen", "127.0.0.1:0")
     url = exporter.expect(r"http://\S+").group()
     assert scrape(url) == {("daedalus_up", ""): 0.0}
+    second = start("router", "--listen", other_address, "--connect", address)
+    second.expect(f"nothing answers at {address}: .*; trying again")
+    learner = start("learner", "cartpole", "--connect", other_address, "--run-dir", "run", *ENDLESS, *SLOW)
     start("router", "--listen", address)
-    learner = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS, *SLOW)
+    second.expect(f"connected to {address}")
     actors = {name: start("actor", "--connect", address, "--name", name, *PLAYING_SLOW) for name in ("a", "b")}
     env_steps = "daedalus_actor_env_steps_total"
     until(lambda: all(scrape(url).get((env_steps, name), 0.0) > 0.0 for name in actors))
