@@ -267,7 +267,6 @@ import os
 import sys
 import gymnasium
 import numpy as np
-from torch import nn
 
 def leave():
     os.makedirs(ELSEWHERE, exist_ok=True)
@@ -296,6 +295,12 @@ class Leaving(gymnasium.Env):
     def render(self):
         return np.zeros((8, 8, 3), np.uint8)
 
+gymnasium.register("Leaving-v0", Leaving)
+"""
+LEAVING_NET = """
+from leaving import leave
+from torch import nn
+
 class Net(nn.Module):
     def __init__(self, space):
         super().__init__()
@@ -305,8 +310,6 @@ class Net(nn.Module):
     def forward(self, observation):
         leave()
         return self.layer(observation)
-
-gymnasium.register("Leaving-v0", Leaving)
 """
 
 
@@ -315,6 +318,7 @@ def test_the_code_of_the_user_may_change_the_working_directory(tmp_path: Path, m
     here, elsewhere, helpers = tmp_path / "here", tmp_path / "elsewhere", str(tmp_path / "helpers")
     here.mkdir()
     (here / "leaving.py").write_text(f"ELSEWHERE = {str(elsewhere)!r}\nHELPERS = {helpers!r}\n{ELSEWHERE}")
+    (here / "leaving_net.py").write_text(LEAVING_NET)  # with torch, which the processes of environments do not import
     monkeypatch.chdir(here)
     monkeypatch.syspath_prepend(helpers)
 
@@ -332,7 +336,7 @@ def test_the_code_of_the_user_may_change_the_working_directory(tmp_path: Path, m
         on_end = on_start
 
     callback = Restless()
-    settings = {**BUDGET["settings"], "policy.encoder": "leaving:Net", "service.log_seconds": 0.05}
+    settings = {**BUDGET["settings"], "policy.encoder": "leaving_net:Net", "service.log_seconds": 0.05}
     settings["evaluation.final_episodes"] = 1
     result = daedalus.train(
         env="leaving:Leaving-v0", run_dir="run", callback=callback, settings=settings, env_steps=600, actors=1
