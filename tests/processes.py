@@ -144,6 +144,13 @@ def processes_mentioning(text: str) -> list[int]:
     return found
 
 
+def is_nothing_left(output: str) -> bool:
+    """Return whether the socket of a finished `daedalus train` is gone, and the processes that connected to it."""
+    socket_file = output.split("unixsock-stream/")[1].split(";")[0]
+    folder = Path(socket_file).parent
+    return not folder.exists() and not processes_mentioning(str(folder))
+
+
 def listening_ports(pid: int) -> list[int]:
     """Return the TCP ports where a process listens."""
     own: set[str] = set()

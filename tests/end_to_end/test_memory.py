@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cue_environment
-from processes import Running, until
+from processes import Running, is_nothing_left, processes_mentioning, until
 
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 
@@ -35,8 +35,10 @@ def test_a_policy_with_memory_solves_the_cue_task(start: Start, tmp_path: Path) 
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["evaluation_return_mean"] > 0.9
 
 
-def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint(start: Start, tmp_path: Path) -> None:
-    """Use stacked frames, convolutions with a memory, appo, and an evaluator process."""
+def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint_and_a_signal_ends_all_its_processes(
+    start: Start, tmp_path: Path
+) -> None:
+    """Use stacked frames, convolutions with a memory, appo, an evaluator process and one for inference."""
     (tmp_path / "pong.toml").write_text(
         """
         environment.id = "ALE/Pong-v5"
@@ -53,18 +55,21 @@ def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint(start: Start
         service = {log_seconds = 0.2}
         """
     )
-    running = start("train", "pong.toml", "--run-dir", "run")
+    running = start("train", "pong.toml", "--run-dir", "pixels-run", "--inference", "shared")
     running.expect(r"evaluation at [\d,]+ env_steps: \S+ \+- 0 over 1 episodes, the best so far")
     until(lambda: running.output.count("evaluation at") >= 2)
     running.process.terminate()
     assert running.wait() == 1
-    with (tmp_path / "run" / "metrics.csv").open(newline="") as file:
+    running.expect("continue with: daedalus resume pixels-run")
+    assert not processes_mentioning("pixels-run")
+    assert is_nothing_left(running.output)
+    with (tmp_path / "pixels-run" / "metrics.csv").open(newline="") as file:
         evaluated = [row for row in csv.DictReader(file) if row["evaluation_return_mean"]]
     assert evaluated
     assert all(int(row["evaluation_env_steps"]) <= int(row["env_steps"]) for row in evaluated)
-    best, *others = best_checkpoints(tmp_path / "run")
+    best, *others = best_checkpoints(tmp_path / "pixels-run")
     assert len(others) <= 2
     assert float(f"{best_score(best):.6g}") >= max(float(row["evaluation_return_mean"]) for row in evaluated)
-    played = start("evaluate", "run", "--episodes", 1, "--json")
+    played = start("evaluate", "pixels-run", "--episodes", 1, "--json")
     assert played.wait() == 0, played.output
     assert json.loads(played.lines[-1])["best_checkpoint"]
