@@ -52,30 +52,8 @@ def players(folder: Path) -> list[int]:
 NOT_YET = "not there yet: the new episodes have a mean return of 0. That is normal"
 
 
-def test_training_continues_until_new_episodes_confirm_the_target(
-    train: Callable[..., Running], tmp_path: Path
-) -> None:
-    (tmp_path / UNLUCKY).touch()
-    running = train()
-    assert running.wait() == 0, running.output
-    reached = [index for index, line in enumerate(running.lines) if line.startswith("target 1 reached: ")]
-    assert len(reached) == 2, running.output + (tmp_path / "run/events.jsonl").read_text()
-    first, second = reached
-    assert any(line.startswith(NOT_YET) for line in running.lines[first:second])
-    result = summary(tmp_path)
-    assert (result["solved"], result["finished"], result["confirmation_return_mean"]) == (True, True, 1.0)
-    confirmation = result["confirmation"]
-    assert (confirmation["confirmed"], confirmation["actions"], confirmation["episodes"]) == (True, "sampled", 10)
-    assert confirmation["policy_version"] == result["updates"]  # the last one, at which training stopped
-    assert result["episodes"] >= 20  # as many new training episodes as the target asks for, before the second attempt
-    asked, refused, confirmed = (each.text for each in read_events(tmp_path / "run") if each.kind == "target")
-    assert asked == confirmed == running.lines[first]
-    assert refused.startswith(NOT_YET)
-    running.expect("confirmation: return 1 over 10 new sampled episodes of the policy at that moment")
-
-
-def test_a_learner_without_launcher_confirms_its_target_too(start: Start, tmp_path: Path) -> None:
-    """It is alone with what actors report, and its evaluator has no certificate for the router."""
+def test_training_continues_until_new_episodes_confirm_the_target(start: Start, tmp_path: Path) -> None:
+    """Also without a launcher: the learner is alone with what actors report, and its evaluator has no certificate."""
     shutil.copy(Path(__file__).parent.parent / "lucky_environment.py", tmp_path)
     (tmp_path / UNLUCKY).touch()
     certificates, address = make_certificates(tmp_path / "certs"), free_address().replace("tcp/", "tls/")
@@ -86,7 +64,18 @@ def test_a_learner_without_launcher_confirms_its_target_too(start: Start, tmp_pa
     start("actor", *connect, certificates / "actor-arm", "--allow-module", "lucky_environment")
     learner.expect(NOT_YET)
     assert learner.wait() == 0, learner.output
-    assert summary(tmp_path)["confirmation_return_mean"] == 1.0
+    asked, refused, confirmed = (each.text for each in read_events(tmp_path / "run") if each.kind == "target")
+    assert asked == confirmed
+    assert asked.startswith("target 1 reached: ")
+    assert refused.startswith(NOT_YET)
+    told = [line for line in learner.lines if line.endswith(asked) or NOT_YET in line]
+    assert [NOT_YET in line for line in told] == [False, True, False], learner.output
+    result = summary(tmp_path)
+    assert (result["solved"], result["finished"], result["confirmation_return_mean"]) == (True, True, 1.0)
+    confirmation = result["confirmation"]
+    assert (confirmation["confirmed"], confirmation["actions"], confirmation["episodes"]) == (True, "sampled", 10)
+    assert confirmation["policy_version"] == result["updates"]  # the last one, at which training stopped
+    assert result["episodes"] >= 20  # as many new training episodes as the target asks for, before the second attempt
 
 
 def test_run_ends_at_its_target_if_the_episodes_cannot_be_played(train: Callable[..., Running], tmp_path: Path) -> None:
@@ -127,6 +116,7 @@ def test_evaluator_and_learner_that_are_killed_play_and_ask_again_and_a_run_that
     (tmp_path / WAITING).unlink()
     resumed = start("resume", "run", "--allow-module", "lucky_environment")
     assert resumed.wait() == 0, resumed.output
+    resumed.expect("confirmation: return 1 over 10 new sampled episodes of the policy at that moment")
     result = summary(tmp_path)
     assert result["episodes"] < stopped["episodes"] + 10  # it asks again before it has played as many new episodes
     assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
