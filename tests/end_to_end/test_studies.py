@@ -16,23 +16,22 @@ LAG = 2
 ROLLOUT = 16 * 128  # env_steps of a rollout of CartPole for a3c; the resets of environments count less
 
 
-def study(folder: Path) -> tuple[list[dict[str, str]], str]:
-    """Make what is missing of a small study; return its lines and what it printed."""
+def words(folder: Path) -> list[str]:
+    """Return the command line of a small study."""
     settings = ["--variants", "a3c rollouts", "a3c gradients", "--lags", "0", str(LAG), "--seeds", "1"]
     budget = ["--tasks", "cartpole", "--env-steps", str(5 * ROLLOUT)]
-    output = subprocess.run(
-        [sys.executable, "-m", "benchmarks.study.lag", "--file", str(folder / "lag.csv"), *settings, *budget],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
+    return ["benchmarks.study.lag", "--file", str(folder / "lag.csv"), *settings, *budget]
+
+
+def read(folder: Path) -> list[dict[str, str]]:
     with open(folder / "lag.csv", newline="") as file:
-        return list(csv.DictReader(file)), output
+        return list(csv.DictReader(file))
 
 
-def test_the_study_of_lag(tmp_path: Path) -> None:
-    rows, output = study(tmp_path)
+def test_the_study_of_lag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [sys.executable, "-m", *words(tmp_path)]
+    output = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    rows = read(tmp_path)
     assert [(row["variant"], row["lag"]) for row in rows] == [
         ("a3c rollouts", "0"),
         ("a3c rollouts", "2"),
@@ -46,13 +45,14 @@ def test_the_study_of_lag(tmp_path: Path) -> None:
     assert "| a3c gradients | 2 | 1.5 |" in output
     lines = (tmp_path / "lag.csv").read_text().splitlines()
     (tmp_path / "lag.csv").write_text("\n".join([lines[0], lines[1], lines[3], lines[4][:20]]))  # cut by a crash
-    again, output = study(tmp_path)
-    assert output.startswith("1 of 2: ")
+    monkeypatch.setattr(sys, "argv", words(tmp_path))
+    importlib.import_module("benchmarks.study.lag").main()  # in this process, to the same results
+    assert capsys.readouterr().out.startswith("1 of 2: ")
 
     def results(lines: list[dict[str, str]]) -> list[list[str]]:
         return sorted([value for name, value in row.items() if name != "seconds"] for row in lines)
 
-    assert results(again) == results(rows)
+    assert results(read(tmp_path)) == results(rows)
 
 
 ROWS = 20
