@@ -2,9 +2,11 @@
 
 import codecs
 import fcntl
+import json
 import os
 import pty
 import re
+import shutil
 import signal
 import struct
 import subprocess
@@ -16,9 +18,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from processes import DAEDALUS, LIMIT, processes_mentioning, until
+from processes import DAEDALUS, ENDLESS, LIMIT, SLOW, processes_mentioning, until
 from saved_runs import save
 from terminal import Terminal
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -103,13 +107,11 @@ def child_of(parent: int, text: str) -> int:
     return child
 
 
-ENDLESS = ("train", "cartpole", "--set", "training.stop_when_solved=false", "--env-steps", "1000000000")
-
-
 def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
     at_terminal: Callable[..., AtTerminal], tmp_path: Path
 ) -> None:
-    running = at_terminal(*ENDLESS, "--run-dir", "shown-run")
+    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
+    running = at_terminal("train", "cartpole", "--run-dir", "shown-run", *map(str, (*ENDLESS, *SLOW)))
     until(lambda: running.fault or (re.search(r"return +\d", running.text) and "actor-1  alive" in running.text))
     os.kill(child_of(running.process.pid, "actor-1"), signal.SIGKILL)
     until(lambda: running.fault or "actor-1 was killed by signal 9" in running.text)  # above the frame
@@ -117,18 +119,22 @@ def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
     assert running.wait() == 1, running.text
     assert running.fault is None
     assert running.terminal.cursor_shown
-    assert running.text.count("CartPole-v1, impala") == 1, running.text
+    header = "slow_environment:Slow-v0, impala"
+    assert running.text.count(header) == 1, running.text
     assert "actor-0" not in running.text
-    frame = next(number for number, line in enumerate(running.terminal.lines) if line.startswith("CartPole-v1, impala"))
+    (frame,) = [number for number, line in enumerate(running.terminal.lines) if line.startswith(header)]
     assert running.terminal.lines[frame + 2].startswith("return ")
     assert "stopped; checkpoint saved at" in "".join(running.terminal.lines[:frame])  # a long line goes on below
     left, how = "report: shown-run/report.html", "stopped; continue with: daedalus resume shown-run"
+    how += " --allow-module slow_environment"
     assert "".join(running.terminal.lines[frame + 5 :]) == left + how
     assert (tmp_path / "shown-run" / "report.html").exists()
     assert not processes_mentioning("shown-run")
 
 
-def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Callable[..., AtTerminal]) -> None:
+def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c_and_is_shown_to_the_operator_only(
+    at_terminal: Callable[..., AtTerminal], tmp_path: Path
+) -> None:
     short = ("--env-steps", "4000", "--set", "evaluation.final_episodes=1", "--actors", "1")
     running = at_terminal("train", "cartpole", "--watch", "--run-dir", "kept-run", *short)
     until(lambda: running.fault or "press Ctrl-C to close it" in running.text.replace("\n", ""))
@@ -137,6 +143,15 @@ def test_the_page_stays_after_the_end_of_the_run_until_ctrl_c(at_terminal: Calla
     assert port is not None
     with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/", timeout=LIMIT) as answer:
         assert answer.status == 200
+    for path in ("actor", "raw"):  # without --clients
+        with pytest.raises(InvalidStatus):
+            connect(f"ws://127.0.0.1:{port[1]}/{path}", open_timeout=LIMIT)
+    file = tmp_path / "kept-run" / "operator-token"
+    assert file.stat().st_mode & 0o077 == 0
+    for token, received in (("", "error"), (file.read_text().strip(), "hello")):
+        with connect(f"ws://127.0.0.1:{port[1]}/watch", open_timeout=LIMIT) as page:
+            page.send(json.dumps({"type": "hello", "token": token}))
+            assert json.loads(page.recv(timeout=LIMIT))["type"] == received
     running.type(b"\x03")
     assert running.wait() == 3  # that of the run
     assert not processes_mentioning("kept-run")
