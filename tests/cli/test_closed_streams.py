@@ -24,7 +24,6 @@ def test_a_command_runs_without_a_standard_stream(tmp_path: Path, stream: str) -
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [
-        (("compare", "nowhere"), 1, "nowhere does not exist"),
         (("evaluate", "nowhere"), 1, "nowhere does not exist"),
         (("train", "cartpol"), 2, "unknown preset 'cartpol'"),
         (("learner", "cartpol"), 2, "unknown preset 'cartpol'"),

@@ -3,14 +3,18 @@
 import re
 import signal
 import subprocess
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 import pytest
+from certificates import make_certificates
 from processes import DAEDALUS, LIMIT, Running, until
 
 from daedalus.cli.command_table import COMMANDS
+from daedalus.cli.commands.actor import actor_options, parser
+from daedalus.launch.actor_process import LeaveRequest, run_actor
 from daedalus.transport.zenoh_transport import listen
 
 Start = Callable[..., Running]
@@ -26,14 +30,12 @@ Start = Callable[..., Running]
             1,
             r"nothing answers at tcp/127.0.0.1:1: is the learner or router running, .* \(tried for 0.3 s\)",
         ),
-        (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs is 0: choose a number from 1 to 4096"),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--actors", "0"], 2, r"--actors is 0: choose a number from 1"),
         (
             ["actor", "--connect", "tcp/127.0.0.1:1", "--inference", "cuda", "--runtime", "onnx"],
             2,
             r"--inference cuda runs the policy with torch: leave out --runtime onnx",
         ),
-        (["actor", "--connect", "tcp/127.0.0.1:1", "--name", "a/b"], 2, r"actor name 'a/b' must be"),
         (["trian"], 2, r"unknown command 'trian': did you mean train"),
     ],
 )
@@ -71,6 +73,23 @@ def test_the_function_of_a_command_reports_a_mistake_in_one_line(
     (line,) = "".join(capfd.readouterr()).splitlines()
     assert re.search(message, line)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_actor_reports_a_mistake_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    certificates = make_certificates(tmp_path / "certs")
+    tcp, tls = ("--connect", "tcp/127.0.0.1:1"), ("--connect", "tls/127.0.0.1:1")
+    for words, message in (
+        ((*tcp, "--envs", "0"), "--envs is 0: choose a number from 1 to 4096"),
+        ((*tcp, "--name", "a/b"), "actor name 'a/b' must be"),
+        (tls, "needs certificates: --tls DIR"),
+        ((*tls, "--tls", certificates / "learner"), "holds the certificate of learner, but actor is required"),
+        ((*tls, "--tls", certificates / "actor-arm", "--name", "box"), "is not for 'box': use --name arm or arm.ANY"),
+    ):
+        options = actor_options(parser().parse_args([*map(str, words)]))
+        assert run_actor(options, threading.Event(), {}, LeaveRequest()) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("daedalus actor: ")
+        assert message in line
 
 
 @pytest.mark.parametrize(

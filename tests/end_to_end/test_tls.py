@@ -2,11 +2,14 @@
 
 import shutil
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
-from certificates import change_certificates, make_certificates
+from certificates import change_certificates, make_certificates, unchecked
 from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
+
+from daedalus.transport.zenoh_transport import listen
 
 Start = Callable[..., Running]
 
@@ -70,29 +73,18 @@ def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls
 def test_mistakes_with_certificates_are_reported_in_one_line(
     start: Start, tls: str, certificates: Path, tmp_path: Path
 ) -> None:
+    """Further mistakes of addresses and certificates: test_bad_input.py, test_router.py, tests/transport."""
     strange = make_certificates(tmp_path / "strange")
-    learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
-    learner.expect("actors join with")
-    to = ("actor", "--connect", tls)
-    for arguments, status, message in (
-        ((*to, "--tls", strange / "actor-arm"), 1, "the two ends use different CAs"),
-        ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner, but actor is required"),
-        ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': use --name arm or arm.ANY"),
-        (to, 2, "needs certificates: --tls DIR"),
-        (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "requires --tls"),
-        (
-            ("actor", "--connect", "tls/nowhere.invalid:1", "--tls", certificates / "actor-arm", "--timeout", 0.1),
-            1,
-            "cannot be resolved to an address",
-        ),
-        (("learner", "cartpole", "--listen", "tcp/0.0.0.0:1"), 2, "is unencrypted and open to every host"),
-        (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner is required"),
-    ):
-        failed = start(*arguments)
-        assert failed.wait() == status, failed.output
-        failed.expect(message)
-        assert "Traceback" not in failed.output
-    assert learner.process.poll() is None
+    with closing(listen([tls], credentials=unchecked(certificates / "router", "router", ""))):
+        for arguments, status, message in (
+            (("actor", "--connect", tls, "--tls", strange / "actor-arm"), 1, "the two ends use different CAs"),
+            (("learner", "cartpole", "--listen", "tcp/0.0.0.0:1"), 2, "is unencrypted and open to every host"),
+            (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner is required"),
+        ):
+            failed = start(*arguments)
+            assert failed.wait() == status, failed.output
+            failed.expect(message)
+            assert "Traceback" not in failed.output
 
 
 def test_users_of_one_router_are_kept_apart(start: Start, tls: str, tmp_path: Path) -> None:
