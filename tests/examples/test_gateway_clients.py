@@ -9,14 +9,12 @@ from pathlib import Path
 
 import node
 import pytest
-from processes import Running, until
+from processes import ENDLESS, Running, starting, until
 
 from daedalus.transport.connecting import connect
 from daedalus.transport.status_query import ask
 
 FOLDER = Path(__file__).parents[2] / "examples" / "gateway"
-COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-ENDLESS = ("--env-steps", "1000000000", "--set", "training.stop_when_solved=false")
 
 
 @pytest.fixture(scope="module")
@@ -25,17 +23,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
     folder = tmp_path_factory.mktemp("run")
     address = f"unixsock-stream/{folder}/learner"
     folder.chmod(0o700)
-    learner = Running([*COMMAND, "learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS], folder)
-    gateway = Running([*COMMAND, "gateway", "--connect", address, "--listen", "127.0.0.1:0"], folder)
-    try:
+    with starting(folder) as start:
+        learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
+        gateway = start("gateway", "--connect", address, "--listen", "127.0.0.1:0")
         gateway.expect("follows run")  # the learner answers
         yield address, gateway.expect(r"ws://127\.0\.0\.1:(\d+)/actor").group(1)
         for process in (gateway, learner):
             process.process.terminate()
             assert process.wait() == 0, process.output
-    finally:
-        gateway.end()
-        learner.end()
 
 
 def command(program: str, port: str, name: str, folder: Path) -> list[str]:
