@@ -1,5 +1,6 @@
 """Processes under test: start them, wait for their output, and find processes that are left."""
 
+import io
 import itertools
 import os
 import re
@@ -10,8 +11,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from dataclasses import dataclass
 from pathlib import Path
+
+from daedalus.cli.command_table import COMMANDS
 
 DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 # The same without the report at the end of a training, as on a machine without matplotlib: its import takes a tenth of
@@ -85,6 +89,25 @@ class Running:
         self._reader.join(LIMIT)
         assert self.process.stdout is not None
         self.process.stdout.close()
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Exit status of a command, and the lines that it printed."""
+
+    status: int
+    lines: list[str]
+
+    def expect(self, pattern: str) -> None:
+        assert any(re.search(pattern, line) for line in self.lines), f"no line matches {pattern!r} in: {self.lines}"
+
+
+def here(command: str, *arguments: object) -> Ended:
+    """Run `daedalus COMMAND ARGUMENTS` in this process: a new one would import for half a second first."""
+    output = io.StringIO()
+    with redirect_stdout(output), redirect_stderr(output):
+        status = COMMANDS[command].run([*map(str, arguments)])
+    return Ended(status, output.getvalue().splitlines())
 
 
 @contextmanager

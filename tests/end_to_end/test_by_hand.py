@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from learner_status import env_steps, learner_status
-from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, here, until
 
 Start = Callable[..., Running]
 LOGGED = ("--log", "wandb")
@@ -48,9 +48,9 @@ def test_an_actor_loads_no_torch_and_uses_little_memory_and_another_that_joins_l
     assert int(re.search(r"VmRSS:\s+(\d+)", status)[1]) <= 150 * 1024  # type: ignore[index]
     start("actor", "--connect", address, "--name", "late", "--envs", 3, "--runtime", "torch", *PLAYING_SLOW)
     until(lambda: env_steps(learner_status(address), "late") > 0)
-    start("status", "--connect", address, "--events").expect("joined  *late  *joined with 3 environments")
-    asked = start("status", "--connect", address, "--json")
-    assert asked.wait() == 0
+    here("status", "--connect", address, "--events").expect("joined  *late  *joined with 3 environments")
+    asked = here("status", "--connect", address, "--json")
+    assert asked.status == 0
     report = json.loads(asked.lines[-1])
     assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 2, "late": 3}
     learner.process.terminate()

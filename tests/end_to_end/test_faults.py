@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from faults import Sender, StallingProxy
 from learner_status import actor_status, env_steps, learner_status
-from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, until
+from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, here, until
 
 from daedalus.protocol import keys
 
@@ -133,7 +133,7 @@ def test_an_actor_that_sends_nan_rewards_is_quarantined_and_prints_the_reason(
         "daedalus actor: the learner asks for environment.id=nan_environment:Broken-v0, but the module nan_environment "
         "may not be imported here; if you trust that code, add --allow-module nan_environment"
     )
-    shown = start("status", "--connect", address)
+    shown = here("status", "--connect", address)
     shown.expect("refused: careful .*, 1 x, ")
     shown.expect("add --allow-module nan_environment")
     actor = start("actor", "--connect", address, "--name", "broken", "--allow-module", "nan_environment")
@@ -169,21 +169,19 @@ def test_the_same_command_continues_a_killed_learner_which_trains_while_the_disk
     assert version > 0
     wait_for_training(status, "loyal")
     assert status()["updates"] > version
-    expect_training_without_checkpoints(second, start, address, tmp_path / "run", status)
+    expect_training_without_checkpoints(second, address, tmp_path / "run", status)
     other = learner("--resume", "--seed", 99)
     assert other.wait() == 2
     assert "has other settings" in other.output
 
 
-def expect_training_without_checkpoints(
-    serving: Running, start: Start, address: str, run: Path, status: Status
-) -> None:
+def expect_training_without_checkpoints(serving: Running, address: str, run: Path, status: Status) -> None:
     """Let no file be written for a while: the learner trains on, and warns."""
     until(lambda: status().get("checkpoint_age_seconds") is not None)
     _, hard = resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE, (0, hard))
     serving.expect("checkpoint not saved")
-    assert start("status", "--connect", address, "--quiet").wait() == 3
+    assert here("status", "--connect", address, "--quiet").status == 3
     assert "checkpoints cannot be saved: File too large" in status()["problems"]
     newest = newest_checkpoint(run)
     wait_for_training(status, "loyal")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from plain import vector_spaces
-from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, free_address, starting, until
+from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, free_address, here, starting, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -109,6 +109,6 @@ def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_th
         actor = start("actor", "--connect", address, *PLAYING_SLOW, directory=Path(__file__).parent.parent)
         assert actor.wait() == 1
         actor.expect("refused.*2 choices.*but this run has.*3 choices")
-        status = start("status", "--connect", address, "--run", "run")
+        status = here("status", "--connect", address, "--run", "run")
         status.expect(rf"refused: .* \({re.escape(socket.gethostname())}, daedalus-rl .*\), 1 x, ")
         status.expect("2 choices, but this run")

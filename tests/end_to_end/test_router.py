@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from certificates import make_certificates
-from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, here, until
 from prometheus_client.parser import text_string_to_metric_families
 
 from daedalus.cli.command_table import COMMANDS
@@ -37,7 +37,7 @@ def test_a_learner_that_waits_for_a_router_is_alive_and_leaves_no_directory(
 ) -> None:
     learner = start("learner", "cartpole", "--connect", address, "--run-dir", "run")
     learner.expect("waiting for it")
-    assert start("status", "--alive", "run").wait() == 0
+    assert here("status", "--alive", tmp_path / "run").status == 0
     learner.process.terminate()
     assert learner.wait() == 0
     assert not (tmp_path / "run").exists()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from certificates import change_certificates, make_certificates, unchecked
-from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, here, until
 
 from daedalus.transport.zenoh_transport import listen
 
@@ -36,15 +36,15 @@ def test_authorised_actors_of_other_machines_join_train_over_tls_until_an_operat
     start("actor", *box, *PLAYING_SLOW).expect("as 'box'")
     train.expect("actors 3")
     asking = ("status", "--connect", tls, "--quiet", "--tls")
-    assert start(*asking, certificates / "actor-arm").wait() == 2
-    until(lambda: start(*asking, certificates / "operator").wait() == 0)
+    assert here(*asking, certificates / "actor-arm").status == 2
+    until(lambda: here(*asking, certificates / "operator").status == 0)
     (run,) = (directory.name for directory in (tmp_path / "runs").iterdir())
     order = ("stop", run, "--connect", tls, "--tls")
-    refused = start(*order, certificates / "actor-arm")
-    assert refused.wait() == 2
+    refused = here(*order, certificates / "actor-arm")
+    assert refused.status == 2
     refused.expect("daedalus stop: .*actor-arm holds the certificate of actor 'arm', but operator or learner or router")
-    stopped = start(*order, certificates / "operator")
-    assert stopped.wait() == 0, stopped.output
+    stopped = here(*order, certificates / "operator")
+    assert stopped.status == 0, stopped
     stopped.expect(f"run '{run}': checkpoint saved at ")
     assert train.wait() == 1
     train.expect("stopped by operator operator at .*; continue with: daedalus resume")
@@ -98,9 +98,9 @@ def test_users_of_one_router_are_kept_apart(start: Start, tls: str, tmp_path: Pa
     learner = start("learner", "cartpole", "--run-dir", "alice", *ENDLESS, *SLOW, *to, folder / "learner-alice")
     start("actor", *to, folder / "actor-arm", *PLAYING_SLOW).expect("joined run 'alice'")
     learner.expect("actors 1")
-    until(lambda: start("status", "--quiet", *to, folder / "operator-ann").wait() == 0)
-    assert start("status", *to, folder / "operator-ben").wait() == 1
-    assert start("stop", "alice", *to, folder / "operator-ben").wait() == 2
+    until(lambda: here("status", "--quiet", *to, folder / "operator-ann").status == 0)
+    assert here("status", *to, folder / "operator-ben").status == 1
+    assert here("stop", "alice", *to, folder / "operator-ben").status == 2
     assert learner.process.poll() is None
-    assert start("stop", "alice", *to, folder / "operator-ann").wait() == 0
+    assert here("stop", "alice", *to, folder / "operator-ann").status == 0
     assert learner.wait() == 0, learner.output
