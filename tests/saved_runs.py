@@ -26,6 +26,8 @@ RACING = EnvironmentSpec(
     frame_stack=4,
 )
 
+_programs: dict[tuple[str, ...], bytes] = {}  # those that were exported, by what they depend on
+
 
 def save(
     run: Path,
@@ -52,12 +54,15 @@ def save(
         weights = {name: gain * array / np.float32(max(4, array[0].size)) ** 0.5 for name, array in weights.items()}
         weights["policy_head.bias"] *= 0.0  # so that actions depend on the observation
         weights["policy_head.weight"] -= weights["policy_head.weight"].mean(1, keepdims=True)
+    architecture = (*(part.model_dump_json() for part in (run_spec.training, run_spec.policy, spaces)),)
+    if architecture not in _programs:
+        _programs[architecture] = learner.program()
     for version in versions:
         encoded = encode_checkpoint(
             spec=run_spec,
             spaces=spaces,
             policy_version=version,
-            program=learner.program(),
+            program=_programs[architecture],
             parameters=weights,
             state=learner.state(),
             counters={},
