@@ -9,6 +9,7 @@ import io
 import json
 import math
 import shutil
+import string
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -20,8 +21,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.components import LeftOut, leaves, nested, without
+from daedalus.actor.environments.components import LeftOut, dtype_misfit, is_text, leaves, nested, without
 from daedalus.policy.saving.regular_files import read_regular, replace_text
+from daedalus.protocol.spaces import unfit_number
 from daedalus.protocol.texts import bounded_text
 
 if TYPE_CHECKING:
@@ -354,19 +356,35 @@ class MinariWriter:
           env_spec: gymnasium's specification of it (EnvSpec), which `minari` makes it from again; None: unknown.
           algorithm: who played, for the metadata.
 
-        Raises DatasetError if it exists.
+        Raises DatasetError if it exists, or Minari has no form for the spaces.
         """
         self.folder = new_dataset_folder(name)
         self._name, self.episodes, self.steps = name, 0, 0
         self._spaces, self._env_spec, self._algorithm = (observation_space, action_space), env_spec, algorithm
+        self._written = _written_space(observation_space), _written_space(action_space)
+        self._check_spaces()
         self._storage: MinariStorage | None = None
         self._failure = ""
+
+    def _check_spaces(self) -> None:
+        from minari.serialization import serialize_space
+
+        reason = ""
+        for space, written in zip(self._spaces, self._written, strict=True):
+            try:
+                serialize_space(written)
+            except NotImplementedError as error:
+                reason = str(error)
+            if len(leaves(space, "value")) != len(leaves(written, "value")):
+                reason = "two keys differ only by a slash: rename one"
+        if reason:
+            raise DatasetError(bounded_text(f"dataset {self._name} cannot be written: {reason}", 500))
 
     def _created(self) -> "MinariStorage":
         from minari.dataset.minari_storage import MinariStorage
 
         self.folder.mkdir(parents=True, exist_ok=True)
-        storage = MinariStorage.new(self.folder / "data", *self._spaces, self._env_spec, jpeg_encoding=False)
+        storage = MinariStorage.new(self.folder / "data", *self._written, self._env_spec, jpeg_encoding=False)
         # Minari empties the file first: a process that is killed then would lose all episodes.
         storage.update_metadata = partial(_update_metadata, self.folder / "data" / "metadata.json")
         known = {_ALGORITHM: self._algorithm} if self._algorithm else {}
@@ -376,7 +394,8 @@ class MinariWriter:
         return storage
 
     def add(self, episode: Episode, seed: int | None = None) -> None:
-        """Write an episode. Raises DatasetError, also before a write that would fill the disk and damage the dataset.
+        """Write an episode. Raises DatasetError, also before a write that would fill the disk and damage the dataset,
+        and for an episode that nothing could learn from.
 
         After a write that has failed, each call does: HDF5 may then crash the process.
         """
@@ -387,10 +406,12 @@ class MinariWriter:
         steps = len(episode.rewards)
         ends = np.zeros((2, steps), np.bool_)
         ends[:, -1] = episode.terminated, episode.truncated
+        if not np.isfinite(episode.rewards).all():
+            raise DatasetError(f"dataset {self._name}: an episode has a reward that is not finite, and is not written")
         buffer = EpisodeBuffer(
             seed=seed,
-            observations=episode.observations,
-            actions=episode.actions,
+            observations=self._as_written(0, episode.observations, "observation"),
+            actions=self._as_written(1, episode.actions, "action"),
             rewards=[*episode.rewards],
             terminations=[*ends[0]],
             truncations=[*ends[1]],
@@ -400,6 +421,26 @@ class MinariWriter:
             self._check_disk(episode)
             self._storage.update_episodes([buffer])
         self.episodes, self.steps = self.episodes + 1, self.steps + steps
+
+    def _as_written(self, which: int, values: Any, what: str) -> Any:
+        """Return values of a space as Minari writes them. Raises DatasetError for those that are none to learn from."""
+        parts: dict[tuple[str | int, ...], Any] = {}
+        for leaf in leaves(self._spaces[which], what):
+            array, path = leaf.of(values), tuple(map(_written_key, leaf.path))
+            if is_text(leaf.space):
+                parts[path] = [*map(str, array)]
+                continue
+            parts[path] = array
+            misfit = dtype_misfit(leaf.space, array)
+            if array.shape[1:] != leaf.space.shape:
+                misfit = f"has the shape {array.shape[1:]}, not {leaf.space.shape}"
+            elif array.nbytes > _EPISODE_BYTES:
+                misfit = f"has {array.nbytes:,} bytes, of which an episode may have {_EPISODE_BYTES:,}"
+            if misfit := misfit or unfit_number(array):
+                where = f"{what} {leaf.name!r}" if leaf.path else what
+                reason = f"an episode is not written, because its {where} {misfit}"
+                raise DatasetError(bounded_text(f"dataset {self._name}: {reason}", 500))
+        return nested(self._written[which], (), parts)
 
     def _check_disk(self, episode: Episode) -> None:
         values = zip(self._spaces, (episode.observations, episode.actions), strict=True)
@@ -414,6 +455,20 @@ class MinariWriter:
         except (OSError, ValueError, RuntimeError) as error:  # as h5py raises
             self._failure = bounded_text(f"dataset {self._name} cannot be written: {error}", 500)
             raise DatasetError(self._failure) from None
+
+
+def _written_space(space: gymnasium.Space) -> gymnasium.Space:
+    """Return the space of what is written: with keys that HDF5 has, and gymnasium's Text in place of other texts."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return gymnasium.spaces.Dict({_written_key(key): _written_space(part) for key, part in space.spaces.items()})
+    if isinstance(space, gymnasium.spaces.Tuple):
+        return gymnasium.spaces.Tuple([_written_space(part) for part in space.spaces])
+    return gymnasium.spaces.Text(_METADATA_BYTES, charset=string.printable) if is_text(space) else space
+
+
+def _written_key(key: Any) -> Any:
+    """Return a key without slashes, which would be groups: of such as dm_control's, which name the same component."""
+    return key.replace("/", "_") if isinstance(key, str) else key
 
 
 def _update_metadata(path: Path, metadata: dict[str, Any]) -> None:

@@ -3,6 +3,8 @@
 import copy
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import gymnasium
@@ -10,7 +12,7 @@ import numpy as np
 
 from daedalus.actor.environments.bots import make_bot
 from daedalus.actor.environments.components import stacked
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors, playing_error
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.minari_files import Episode, MinariWriter
@@ -77,6 +79,7 @@ class Recorder(gymnasium.Wrapper):
         """Record `episodes` episodes, the first one of the environment with this seed, the next with the next."""
         super().__init__(environment)
         self._writer, self._wanted, self._seed = writer, episodes, seed
+        self._name = environment.spec.id if environment.spec is not None else type(environment.unwrapped).__name__
         self._observations: list[Any] = []
         self._actions: list[Any] = []
         self._rewards: list[float] = []
@@ -92,22 +95,26 @@ class Recorder(gymnasium.Wrapper):
         """Begin an episode, with the recorder's own seed. Raises _EnoughError after the last one."""
         if len(self.returns) >= self._wanted:
             raise _EnoughError
-        observation, info = self.env.reset(seed=self.seed, options=options)
+        with self._faults("reset"):
+            observation, info = self.env.reset(seed=self.seed, options=options)
         self._observations, self._actions, self._rewards = [copy.deepcopy(observation)], [], []
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and write the episode if it ends. Raises DatasetError."""
+        """Step, and write the episode if it ends. Raises DatasetError, and EnvironmentSetupError if it cannot be."""
         if self._gamepad is not None:
             action = self._gamepad.action()
         # Environments and players may use the same arrays again.
         self._actions.append(copy.deepcopy(action))
-        result = observation, reward, terminated, truncated, _ = self.env.step(action)
-        self._observations.append(copy.deepcopy(observation))
-        self._rewards.append(float(reward))
+        with self._faults("step"):
+            result = observation, reward, terminated, truncated, _ = self.env.step(action)
+            self._observations.append(copy.deepcopy(observation))
+            self._rewards.append(float(reward))
         if terminated or truncated:
+            with self._faults("step"):  # such as observations of different shapes
+                observations = stacked(self.observation_space, self._observations)
             episode = Episode(
-                observations=stacked(self.observation_space, self._observations),
+                observations=observations,
                 actions=stacked(self.action_space, self._actions),
                 rewards=np.array(self._rewards),
                 terminated=bool(terminated),
@@ -116,6 +123,16 @@ class Recorder(gymnasium.Wrapper):
             self._writer.add(episode, seed=self.seed)
             self.returns.append(sum(self._rewards))
         return result
+
+    @contextmanager
+    def _faults(self, call: str) -> Iterator[None]:
+        """Raise EnvironmentSetupError for whatever the environment raises."""
+        try:
+            yield
+        except EnvironmentSetupError:
+            raise
+        except Exception as error:  # broad: the user's code may raise anything
+            raise playing_error(self._name, call, error) from error
 
     def play(self, player: Player) -> None:
         """Let a player play all episodes. Raises EnvironmentSetupError for its faults, and DatasetError."""

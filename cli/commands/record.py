@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, modules_of
 from daedalus.protocol.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from daedalus.actor.environments.minari_files import MinariWriter
 
 _KEYS, _GAMEPAD = "keys", "gamepad"
 
@@ -166,7 +169,7 @@ def _json(text: str, where: str) -> Any:
 def _record(
     parsed: argparse.Namespace, keys: dict[str, Any] | None, idle: Any, axes: Sequence[tuple[str, int, bool]]
 ) -> int:
-    from daedalus.actor.environments.minari_files import MinariWriter
+    from daedalus.actor.environments.minari_files import DatasetError, MinariWriter
     from daedalus.actor.evaluation.dataset_recorder import (
         BotPlayer,
         PolicyPlayer,
@@ -209,12 +212,20 @@ def _record(
                 recorder.play(player)
         except KeyboardInterrupt:
             stopped = True
+        except (DatasetError, EnvironmentSetupError):
+            if writer.episodes:
+                _say_what_is_recorded(writer, recorder.returns)
+            raise
     finally:
         environment.close()
-    returns = f"; return {np.mean(recorder.returns):g} +- {np.std(recorder.returns):g}" if recorder.returns else ""
-    say(f"{writer.folder}: {writer.steps:,} steps in {writer.episodes:,} episodes{returns}", sys.__stdout__)
+    _say_what_is_recorded(writer, recorder.returns)
     if writer.episodes < parsed.episodes:
         how = "stopped" if stopped else "ended"
         print_error("record", f"{how} after {writer.episodes} of {parsed.episodes} episodes")
         return 1
     return 0
+
+
+def _say_what_is_recorded(writer: "MinariWriter", returns: Sequence[float]) -> None:
+    mean = f"; return {np.mean(returns):g} +- {np.std(returns):g}" if returns else ""
+    say(f"{writer.folder}: {writer.steps:,} steps in {writer.episodes:,} episodes{mean}", sys.__stdout__)

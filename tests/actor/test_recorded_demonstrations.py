@@ -29,6 +29,10 @@ class Pump:
 class Unseen(CartPoleEnv):
     def render(self):
         return None
+
+class Broken(CartPoleEnv):
+    def step(self, action):
+        raise RuntimeError("the pole is gone")
 """
 
 
@@ -110,6 +114,7 @@ def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) 
         (("--env", "CartPole-v1", "--by", "gamepad", "--axis", "leftx"), 2, "write AXIS=N"),
         (("--env", "pumping:Unseen", "--by", "keys", "--key", "a=1"), 1, "render() must return an array"),
         (("--env", "CartPole-v1", "--by", "pumping:Nobody"), 1, "Nobody"),
+        (("--env", "pumping:Broken", "--by", "random"), 1, "Broken: step raises RuntimeError: the pole is gone"),
         (("--env", "pettingzoo.classic.connect_four_v3", "--by", "random"), 1, "datasets are of one agent"),
     ],
 )

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
+from mission_environment import MissionSpace
 from PIL import Image
 
 from daedalus.actor.environments.minari_files import DatasetError, Episode, MinariReader, MinariWriter
@@ -156,6 +157,47 @@ def test_minari_reads_what_is_recorded(tmp_path: Path) -> None:
             np.testing.assert_array_equal(found.observations, recorded.observations)
             np.testing.assert_array_equal(found.actions, recorded.actions)
             np.testing.assert_array_equal(found.rewards, recorded.rewards)
+
+
+def test_texts_and_keys_with_slashes_are_recorded(tmp_path: Path) -> None:
+    arm = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    space = gymnasium.spaces.Dict({"arm/angle": arm, "mission": MissionSpace()})  # as dm_control's and MiniGrid's
+    writer = MinariWriter(str(tmp_path / "shown"), space, gymnasium.spaces.Dict({"arm/turn": arm}))
+    seen, done = np.array([[0.5], [0.75]], np.float32), {"arm/turn": np.array([[0.25]], np.float32)}
+    writer.add(Episode({"arm/angle": seen, "mission": np.array(["go on", "on"])}, done, np.ones(1), True, False))
+    with MinariReader(str(tmp_path / "shown"), ["mission"]) as dataset:
+        (episode,) = dataset
+        found, wanted = (
+            Transforms(spec_of().environment, each, ACTIONS).spaces
+            for each in (dataset.observation_space, gymnasium.spaces.Dict({"arm/angle": arm}))
+        )
+    assert found == wanted
+    np.testing.assert_array_equal(episode.observations["arm_angle"], seen)
+    np.testing.assert_array_equal(episode.actions["arm_turn"], done["arm/turn"])
+    theirs = minari.MinariDataset(tmp_path / "shown/data")
+    assert [*theirs[0].observations["mission"]] == ["go on", "on"]
+
+
+@pytest.mark.parametrize(
+    ("space", "observations", "reward", "reason"),
+    [
+        (OBSERVATIONS, np.zeros((2, 2)), np.nan, "a reward that is not finite"),
+        (OBSERVATIONS, np.full((2, 2), np.nan), 0.0, "its observation has a value that is not finite"),
+        (OBSERVATIONS, np.zeros((2, 2, 1)), 0.0, "its observation has the shape"),
+        (gymnasium.spaces.Discrete(3), np.array([0.5, 1.0]), 0.0, "its observation has the value 0.5"),
+        (gymnasium.spaces.Sequence(ACTIONS), None, 0.0, "No serialization method available"),
+    ],
+)
+def test_what_nothing_could_learn_from_is_not_recorded(
+    tmp_path: Path, space: gymnasium.Space, observations: Any, reward: float, reason: str
+) -> None:
+    def write() -> None:
+        writer = MinariWriter(str(tmp_path / "shown"), space, ACTIONS)
+        writer.add(Episode(observations, np.zeros((1, 2), np.float32), np.array([reward]), True, False))
+
+    with pytest.raises(DatasetError, match=reason):
+        write()
+    assert not (tmp_path / "shown").exists()
 
 
 def test_what_is_recorded_survives_a_kill_and_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
