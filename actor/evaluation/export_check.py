@@ -10,13 +10,15 @@ import numpy as np
 import onnxruntime
 from gymnasium import spaces as gym
 
-from daedalus.actor.environments.components import leaves, nested, only_of_batch, stacked
+from daedalus.actor.environments.components import continuous_space, leaves, nested, only_of_batch, stacked
 from daedalus.actor.environments.games import GameEnvironments
 from daedalus.actor.evaluation.loaded_policy import Policy, another_player, environments_of
 from daedalus.policy.saving.onnx_graph import NOISE, noise_of
 
 _LONGEST_EPISODE = 10_000  # steps; an environment may have no limit of its own
-TOLERANCE = 1e-5  # of numbers of an action, in parts of its size or of 1
+_SMALLEST = 1e-30  # range of an action: both bounds may be 0
+# Of a number of an action, in parts of its range, of which float32 rounds parts, or of the action if that is larger.
+TOLERANCE = 1e-5
 
 
 class ExportedPlayer(Policy):
@@ -46,6 +48,7 @@ class ExportedPlayer(Policy):
             leaves(space, name)
             for space, name in ((self.observation_space, "observation"), (self.action_space, "action"))
         )
+        self._ranges = {leaf.name: _ranges(leaf.space) for leaf in self._acted}
         self.choices = self.different = 0  # actions, and those that differ from the policy's
         self.largest_difference = 0.0
 
@@ -91,13 +94,24 @@ class ExportedPlayer(Policy):
         differs = False
         for leaf in self._acted:
             expected, found = leaf.of(ours).astype(np.float64), leaf.of(theirs).astype(np.float64)
-            difference = float((np.abs(expected - found) / np.maximum(1.0, np.abs(expected))).max())
+            sizes = np.maximum(np.maximum(self._ranges[leaf.name], np.abs(expected)), _SMALLEST)
+            difference = float((np.abs(expected - found) / sizes).max())
             continuous = isinstance(leaf.space, gym.Box)
             differs |= difference > (TOLERANCE if continuous else 0.0)
             if continuous:
                 self.largest_difference = max(self.largest_difference, difference)
         self.choices += 1
         self.different += differs
+
+
+def _ranges(space: gym.Space) -> np.ndarray:
+    """Return the range of each number of an action between its bounds, or 1 where one is missing."""
+    if not isinstance(space, gym.Box):
+        return np.ones(space.shape or ())
+    bounds = continuous_space(space)
+    pairs = zip(bounds.low, bounds.high, strict=True)
+    ranges = [1.0 if low is None or high is None else high - low for low, high in pairs]
+    return np.reshape(ranges, space.shape)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +121,7 @@ class Played:
     steps: int
     choices: int  # actions that the policy chose, over all seats; a repeated one counts once
     different: int  # of these, those that the policy itself would not have chosen
-    largest_difference: float  # of a number of an action, in parts of its size or of 1
+    largest_difference: float  # of a number of an action, in parts of its range, or of the action
     returns: tuple[float, ...]  # of the episodes that ended, without scaling; of a game the mean of the seats
 
     @property

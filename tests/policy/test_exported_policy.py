@@ -56,6 +56,8 @@ PARTS = gym.Dict(
         "0": gym.Tuple((gym.Box(0.0, 2.0, (2, 2), np.float64), gym.MultiBinary((2, 2)))),
         "free": gym.Box(np.array([0, -np.inf], np.float32), np.array([np.inf, np.inf], np.float32)),
         "whole": gym.Box(-3, 7, (2,), np.int16),
+        "wide": gym.Box(-1e6, 1e6, (1,)),
+        "fixed": gym.Box(0.0, 0.0, (2,)),
     }
 )
 BOARD = gym.Dict({"observation": gym.Box(0, 1, (3, 3, 2), np.int8), "action_mask": gym.Box(0, 1, (9,), np.int8)})
