@@ -106,11 +106,11 @@ class ClientSpaces:
         """Return an action as gymnasium has it, from one as `action` returns it. Raises ClientError if it is none."""
         bare = self._actions.keys() == {"action"} and not isinstance(value, dict)
         parts = {"action": value} if bare else _components(value, self._actions.keys(), "the override")
-        for name, space in self._actions.items():
-            _check_action(parts[name], space, "the override" if bare else f"{name} of the override")
-        if self._actions.keys() == {"action"}:
-            return parts["action"]
-        return _nested({name: np.asarray(part) for name, part in parts.items()})
+        actions = {
+            name: _checked_action(parts[name], space, "the override" if bare else f"{name} of the override")
+            for name, space in self._actions.items()
+        }
+        return actions["action"] if actions.keys() == {"action"} else _nested(actions)
 
     def action(self, value: Any) -> Any:
         """Return gymnasium's action as numbers, lists and maps by component."""
@@ -256,7 +256,8 @@ def _out_of_range(space: ArraySpace | DiscreteSpace, what: str) -> ClientError:
     return ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observations")
 
 
-def _check_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str) -> None:
+def _checked_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str) -> Any:
+    """Return one component of an action as gymnasium has it, from a list or, if it is one number, from that."""
     types, kind = ({int}, "integers") if isinstance(space, DiscreteSpace) else ({int, float}, "numbers")
     try:
         _, elements = _flat(value)
@@ -268,11 +269,14 @@ def _check_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str)
     if isinstance(space, DiscreteSpace):
         fits = (numbers >= 0) & (numbers < space.counts)
     else:
-        low = np.array([-np.inf if bound is None else bound for bound in space.low])
-        high = np.array([np.inf if bound is None else bound for bound in space.high])
+        with np.errstate(over="ignore"):
+            numbers = numbers.astype(np.float32)  # as the bounds are
+        low = np.array([-np.inf if bound is None else bound for bound in space.low], np.float32)
+        high = np.array([np.inf if bound is None else bound for bound in space.high], np.float32)
         fits = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
     if not fits.all():
         raise ClientError("misfit", f"{what} is outside its space, {space}")
+    return np.int64(numbers[0]) if isinstance(space, DiscreteSpace) and space.size == 1 else numbers
 
 
 def _mask(value: Any, space: _Component, name: str) -> np.ndarray:

@@ -280,9 +280,18 @@ def test_largest_legal_message_fits_the_limit() -> None:
     assert len(message) <= spaces.max_message_bytes < 10_000
 
 
-@pytest.mark.parametrize("value", [1, [1]])
-def test_override_is_an_action_of_the_space(value: Any) -> None:
-    ClientSpaces({"observation": PLAIN}, {"action": CHOICE}).checked_action(value)
+PUSH = {"kind": "continuous", "low": [-0.7], "high": [0.1]}  # which float32 does not have
+
+
+@pytest.mark.parametrize(
+    ("action", "value", "learned"),
+    [(CHOICE, 1, 1), (CHOICE, [1], 1), (PUSH, 0.1, 1.0), (PUSH, [[-0.7]], -1.0), (PUSH, [float(np.float32(0.1))], 1.0)],
+)
+def test_override_is_an_action_that_can_be_learned_from(action: Any, value: Any, learned: float) -> None:
+    spaces = ClientSpaces({"observation": PLAIN}, {"action": action})
+    transforms = Transforms(run_spec().environment, spaces.observation_space, spaces.action_space)
+    played = transforms.policy_action(spaces.checked_action(value))
+    assert played["action"] == np.array([[learned]], np.float32)
 
 
 @pytest.mark.parametrize(
