@@ -174,6 +174,7 @@ def inputs_and_outputs(model: bytes) -> list[str]:
     if any(entry.name.partition(".")[0] == MASK_KEY for entry in session.get_inputs()):
         repeats += ", or until a mask forbids it"
     left = [
+        *([f"wrap the environment with {caller['wrapper']}"] if caller["wrapper"] else []),
         *([repeats] if caller["repeat_each_action"] > 1 else []),
         *(["show the maximum of the two newest frames"] if caller["maximum_of_two_frames"] else []),
     ]

@@ -246,6 +246,7 @@ def exported_bytes(policy: Policy, options: "ExportOptions") -> bytes:
         "repeat_each_action": policy._repeat,
         "maximum_of_two_frames": policy._pools_frames,
         "left_out": policy.spec.environment.leave_out,
+        "wrapper": policy.spec.environment.wrap,
     }
     spaces, size = (policy.observation_space, policy.action_space), policy._runtime.noise_size
     return exported_file(policy._saved, policy._transforms, spaces, size, options, caller)

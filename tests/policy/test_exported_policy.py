@@ -17,7 +17,7 @@ import daedalus
 from daedalus.actor.environments.components import leaves
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.evaluation.export_check import ExportedPlayer
-from daedalus.actor.evaluation.exported_policy import ExportOptions
+from daedalus.actor.evaluation.exported_policy import ExportOptions, inputs_and_outputs
 from daedalus.actor.evaluation.loaded_policy import exported_bytes
 from daedalus.cli.commands.export import export
 from daedalus.learner.run.settings import preset_names, read_preset
@@ -183,6 +183,15 @@ def test_policy_repeats_an_action_no_longer_than_its_mask_allows(tmp_path: Path)
     ]
     assert [action in each for action, each in zip(played, legal, strict=True)] == [True] * 7
     assert len(set(played[:2])) == len(set(played[2:5])) == 1
+
+
+def test_file_says_what_is_left_to_the_caller(tmp_path: Path) -> None:
+    policy = policy_of(
+        tmp_path / "run", CASES["squashed"]._replace(environment={"wrap": "my:scaled", "action_repeat": 2})
+    )
+    assert inputs_and_outputs(exported_bytes(policy, ExportOptions()))[-1] == (
+        "left to the caller: wrap the environment with my:scaled; give each action 2 times"
+    )
 
 
 def test_command_checks_the_file_and_says_what_is_inside(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
