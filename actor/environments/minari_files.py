@@ -436,7 +436,7 @@ class MinariWriter:
                 misfit = f"has the shape {array.shape[1:]}, not {leaf.space.shape}"
             elif array.nbytes > _EPISODE_BYTES:
                 misfit = f"has {array.nbytes:,} bytes, of which an episode may have {_EPISODE_BYTES:,}"
-            if misfit := misfit or unfit_number(array):
+            if misfit := misfit or unfit_number(array.astype(np.float64, copy=False)):
                 where = f"{what} {leaf.name!r}" if leaf.path else what
                 reason = f"an episode is not written, because its {where} {misfit}"
                 raise DatasetError(bounded_text(f"dataset {self._name}: {reason}", 500))

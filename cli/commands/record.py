@@ -123,6 +123,9 @@ def record(arguments: list[str]) -> int:
     if (parsed.directory is None) == (parsed.env is None) or (parsed.env is None) != (parsed.by is None):
         print_error("record", "name either a run directory, or --env ID and --by PLAYER")
         return 2
+    if fault := _without_effect(parsed):
+        print_error("record", fault)
+        return 2
     from daedalus.actor.environments.minari_files import DatasetError
 
     try:
@@ -134,6 +137,22 @@ def record(arguments: list[str]) -> int:
             return 2
         print_error("record", error)
         return 1
+
+
+def _without_effect(parsed: argparse.Namespace) -> str:
+    """Return what is wrong with an option that would have no effect, or an empty string."""
+    given = {
+        "a RUN_DIR": {"--sampled": parsed.sampled, "--newest": parsed.newest},
+        "--by keys or gamepad": {"--key": parsed.key, "--idle": parsed.idle, "--rate": parsed.rate},
+        "--by gamepad": {"--axis": parsed.axis},
+    }
+    played = {"a RUN_DIR": parsed.env is None, "--by keys or gamepad": parsed.by in (_KEYS, _GAMEPAD)}
+    played["--by gamepad"] = parsed.by == _GAMEPAD
+    for player, options in given.items():
+        for option, value in options.items():
+            if value and not played[player]:
+                return f"{option} is for {player}: leave it out"
+    return "" if parsed.episodes else "--episodes 0 must be at least 1"
 
 
 def _actions(parsed: argparse.Namespace) -> tuple[dict[str, Any] | None, Any]:
