@@ -55,6 +55,6 @@ int main(int count, char **words) {
       x += .02 * v, v += .02 * (f - .05 * turn * cos(a)) / 1.1, a += .02 * w, w += .02 * turn;
     }
     put(1, text, snprintf(text, sizeof text, "{\"type\":\"end_episode\",\"terminated\":%s,\"observation\":[%g,%g,%g,%g],"
-      "\"reward\":1}", steps < 500 ? "true" : "false", x, v, a, w));
+      "\"reward\":1}", fabs(x) > 2.4 || fabs(a) > .2095 ? "true" : "false", x, v, a, w));
   }
 }
