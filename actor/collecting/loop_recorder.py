@@ -14,6 +14,8 @@ from daedalus.actor.environments.minari_files import DatasetError, Episode, Mina
 
 _logger = logging.getLogger(__name__)
 
+_BothSpaces = tuple[gymnasium.Space, gymnasium.Space]  # of observations and actions
+
 _MOST_BYTES, _MOST_HELD = 64 << 20, 1 << 30  # of an episode, and of all that are not written yet
 
 
@@ -32,18 +34,14 @@ class LoopRecorder:
         except OSError as error:  # now, and not after the first episode
             raise DatasetError(f"dataset {name} cannot be written: {error}") from None
         self._name = name
-        self._spaces: tuple[gymnasium.Space, gymnasium.Space] | None = None  # of observations and actions
+        self._spaces: _BothSpaces | None = None  # of the first episode
         self._waiting: queue.SimpleQueue[tuple[Episode, int] | None] = queue.SimpleQueue()
         self._held, self._lock = 0, threading.Lock()
         self._complaints = set[str]()
         self._thread: threading.Thread | None = None
 
-    def tape(self, observation_space: gymnasium.Space, action_space: gymnasium.Space) -> "EpisodeTape | None":
-        """Return what records an agent with these spaces; None if they are not those of the first agent."""
-        self._spaces = self._spaces or (observation_space, action_space)
-        if self._spaces != (observation_space, action_space):
-            self.warn("its agent has other spaces than the first one")
-            return None
+    def tape(self, observation_space: gymnasium.Space, action_space: gymnasium.Space) -> "EpisodeTape":
+        """Return what records an agent with these spaces, of which no episode may come: a learner may refuse it."""
         return EpisodeTape(self, observation_space, action_space)
 
     def hold(self, size: int) -> bool:
@@ -52,8 +50,13 @@ class LoopRecorder:
             self._held += size
             return self._held <= _MOST_HELD
 
-    def add(self, episode: Episode, size: int) -> None:
-        """Write an episode, of `size` bytes that are held, soon."""
+    def add(self, episode: Episode, size: int, spaces: _BothSpaces) -> None:
+        """Write an episode, of `size` bytes that are held, soon, unless an earlier one had other spaces."""
+        self._spaces = self._spaces or spaces
+        if self._spaces != spaces:
+            self.warn("its agent has other spaces than the first one")
+            self.hold(-size)
+            return
         if self._thread is None:
             self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
             self._thread.start()
@@ -186,5 +189,5 @@ class EpisodeTape:
                 truncated=truncated,
             )
             size, self._bytes = self._bytes, 0
-            self._recorder.add(episode, size)
+            self._recorder.add(episode, size, (self._observation_space, self._action_space))
         self.drop()

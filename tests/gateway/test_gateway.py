@@ -554,6 +554,10 @@ def test_clients_of_a_synchronous_run_go_on_between_updates_and_those_rows_are_n
 def test_episodes_of_clients_are_recorded(network: MemoryNetwork, learner: ScriptedLearner, tmp_path: Path) -> None:
     running = RunningGateway(network, record=str(tmp_path / "played"))
     with contextlib.closing(running), contextlib.closing(JsonClient(running.port)) as client:
+        with contextlib.closing(JsonClient(running.port)) as other:  # which the learner refuses: it plays nothing
+            learner.refusal = Refusal(code="mismatch", reason="the actor has 3 choices")
+            other.hello("arm-2", {**CARTPOLE, "actions": {"action": {"kind": "discrete", "counts": [3]}}})
+            learner.refusal = None
         client.hello("arm-1")
         played = [client.act([0.0, 0.0, 0.0, 0.0], override=1)["action"]]
         played.append(client.act([1.0, 0.0, 0.0, 0.0], reward=1.0)["action"])
