@@ -52,8 +52,11 @@ class PolicyPlayer:
         self._policy.reset(seed=seed)
 
     def act(self, observation: Any, action_mask: Any) -> Any:
-        """See Player."""
-        return self._policy.act(observation, sampled=self._sampled, action_mask=action_mask)
+        """See Player. Raises EnvironmentSetupError for an observation that the policy cannot act on."""
+        try:
+            return self._policy.act(observation, sampled=self._sampled, action_mask=action_mask)
+        except ValueError as error:
+            raise EnvironmentSetupError(f"environment {self._policy.spec.environment.id}: {error}") from None
 
 
 class BotPlayer:

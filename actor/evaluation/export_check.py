@@ -11,6 +11,7 @@ import onnxruntime
 from gymnasium import spaces as gym
 
 from daedalus.actor.environments.components import continuous_space, leaves, nested, only_of_batch, stacked
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import GameEnvironments
 from daedalus.actor.evaluation.loaded_policy import Policy, another_player, environments_of
 from daedalus.policy.saving.onnx_graph import NOISE, noise_of
@@ -147,7 +148,10 @@ def play_exported(
         players = [ExportedPlayer.of(policy, model) for _ in range(environments.count)]
 
         def act(seat: int, observation: Any, mask: Any) -> Any:
-            return players[seat].act(observation, sampled=sampled, action_mask=mask)
+            try:
+                return players[seat].act(observation, sampled=sampled, action_mask=mask)
+            except ValueError as error:  # of an observation that no policy can act on
+                raise EnvironmentSetupError(f"environment {policy.spec.environment.id}: {error}") from None
 
         def begin(seed: int) -> None:
             for number, player in enumerate(players):

@@ -9,10 +9,13 @@ import minari
 import numpy as np
 import pygame
 import pytest
+from saved_runs import save
 
 from daedalus.actor.environments.minari_files import MinariWriter
 from daedalus.actor.evaluation.dataset_recorder import Recorder
+from daedalus.cli.commands.export import export
 from daedalus.cli.commands.record import record
+from daedalus.protocol.spec import EnvironmentSpec
 
 PUMP = """
 import numpy as np
@@ -145,3 +148,15 @@ def test_a_person_without_a_display_is_told_so(
         monkeypatch.delenv(name, raising=False)
     assert recorded("--env", "CartPole-v1", "--by", "keys", "--key", "a=1", "--episodes", 1) == 1
     assert "there is no display for the window" in capsys.readouterr().err
+
+
+def test_an_observation_that_no_policy_can_act_on_ends_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    environment = EnvironmentSpec(id="faulty_environments:Faulty-v0", kwargs={"fault": "nan"})
+    run, allowed = save(tmp_path / "run", environment, 1), ("--allow-module", "faulty_environments")
+    assert record([str(run), "--out", str(tmp_path / "shown"), *allowed]) == 1
+    assert export([str(run), str(tmp_path / "policy.onnx"), "--check", *allowed]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.removeprefix("daedalus record: ") == second.removeprefix("daedalus export: ")
+    assert "Faulty-v0: the observation has a value that is not finite (nan)" in first
