@@ -6,7 +6,7 @@ The program (policy/acting/program.py) is taken as it is. Around it, the environ
 
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -223,7 +223,7 @@ def noise_of(uniform: np.ndarray, size: NoiseSize) -> Noise:
     return Noise(uniform=own, normal=normal)
 
 
-def _needed(nodes: list[Any], outputs: Mapping[str, Any]) -> list[Any]:
+def _needed(nodes: list[Any], outputs: Iterable[str]) -> list[Any]:
     """Return the nodes that the outputs depend on, such as not those of the log-probability."""
     wanted, kept = set(outputs), []
     for node in reversed(nodes):
@@ -274,12 +274,31 @@ def _in_float16(model: "onnx.ModelProto") -> "onnx.ModelProto":
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # each number that is rounded to the next that float16 has
         converted = ONNXModel(convert_float_to_float16(model, keep_io_types=True, node_block_list=_in_full(model)))
+    graph = converted.model.graph
     # A value that several nodes take in float32 is cast for each, under one name.
-    once = {tuple(node.output): node for node in converted.model.graph.node}
-    del converted.model.graph.node[:]
-    converted.model.graph.node.extend(once.values())
+    nodes = list({tuple(node.output): node for node in graph.node}.values())
+    _skip_rounding(nodes)
+    _replace(graph.node, nodes)
     converted.topological_sort()
+    _replace(graph.node, _needed(list(graph.node), [output.name for output in graph.output]))
     return converted.model
+
+
+def _replace(nodes: Any, others: list[Any]) -> None:
+    del nodes[:]
+    nodes.extend(others)
+
+
+def _skip_rounding(nodes: list[Any]) -> None:
+    """Let values go from one node to another in float32, where both keep it: the converter rounds them in between."""
+    exact = {
+        node.output[0]: node.input[0]
+        for node in nodes
+        if node.name.startswith("graph_input_cast") or node.name.endswith("_cast_to_fp16_node")
+    }
+    for node in nodes:
+        if node.name.startswith("graph_output_cast") or node.name.endswith("_cast_to_fp32_node"):
+            node.input[0] = exact.get(node.input[0], node.input[0])
 
 
 def _in_int8(model: "onnx.ModelProto") -> "onnx.ModelProto":
