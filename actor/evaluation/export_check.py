@@ -96,7 +96,7 @@ class ExportedPlayer(Policy):
         for leaf in self._acted:
             expected, found = leaf.of(ours).astype(np.float64), leaf.of(theirs).astype(np.float64)
             sizes = np.maximum(np.maximum(self._ranges[leaf.name], np.abs(expected)), _SMALLEST)
-            difference = float((np.abs(expected - found) / sizes).max())
+            difference = float(np.nan_to_num(np.abs(expected - found) / sizes, nan=np.inf).max())
             continuous = isinstance(leaf.space, gym.Box)
             differs |= difference > (TOLERANCE if continuous else 0.0)
             if continuous:

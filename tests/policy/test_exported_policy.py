@@ -247,6 +247,13 @@ def test_smaller_numbers_choose_nearly_the_same_actions(tmp_path: Path, quantize
     assert {"float16": onnx.TensorProto.FLOAT16, "int8": onnx.TensorProto.UINT8}[quantize] in sizes
 
 
+def test_an_action_that_is_no_number_differs(tmp_path: Path) -> None:
+    policy = policy_of(tmp_path / "run", Case(gym.Box(-1e9, 1e9, (5,)), gym.Box(-1, 1, (2,))))
+    player = ExportedPlayer.of(policy, exported_bytes(policy, ExportOptions(quantize="float16")))
+    player.act(np.array([1e9, -1e9, 1e9, -1e9, 1e9], np.float32))  # which float16 does not have
+    assert (player.different, player.largest_difference) == (1, np.inf)
+
+
 def test_bad_input_is_refused_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     run, path = save(tmp_path / "run", CARTPOLE, 1), tmp_path / "policy.onnx"
     path.write_text("mine")
