@@ -87,6 +87,7 @@ class Recorder(gymnasium.Wrapper):
         self._actions: list[Any] = []
         self._rewards: list[float] = []
         self._gamepad: Gamepad | None = None  # chooses the actions in place of whoever steps
+        self._plays = False  # itself, and not a loop of the user's, which gets the environment's own exceptions
         self.returns: list[float] = []  # of the recorded episodes
 
     @property
@@ -129,16 +130,19 @@ class Recorder(gymnasium.Wrapper):
 
     @contextmanager
     def _faults(self, call: str) -> Iterator[None]:
-        """Raise EnvironmentSetupError for whatever the environment raises."""
+        """Raise EnvironmentSetupError for whatever the environment raises while `play` or `play_in_window` plays."""
         try:
             yield
         except EnvironmentSetupError:
             raise
         except Exception as error:  # broad: the user's code may raise anything
+            if not self._plays:
+                raise
             raise playing_error(self._name, call, error) from error
 
     def play(self, player: Player) -> None:
         """Let a player play all episodes. Raises EnvironmentSetupError for its faults, and DatasetError."""
+        self._plays = True
         while len(self.returns) < self._wanted:
             player.reset(self.seed)
             observation, info = self.reset()
@@ -169,7 +173,7 @@ class Recorder(gymnasium.Wrapper):
             raise EnvironmentSetupError(f"a window needs pygame: {INSTALL_PYGAME}") from None
         import pygame
 
-        space, self._gamepad = self.action_space, gamepad
+        space, self._gamepad, self._plays = self.action_space, gamepad, True
         actions = {} if gamepad is not None else keys
         if actions is not None:
             actions = {"".join(key): action_of(space, value) for key, value in actions.items()}
