@@ -189,6 +189,7 @@ def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int)
     if most is not None and columns * column > most:
         fitting = most // column * rollout_length
         remedy = f"set training.replay_transitions={fitting} or fewer" if fitting else "use smaller observations"
+        remedy += "" if spec.replay_megabytes is None else ", or raise training.replay_megabytes"
         raise SettingsError(
             f"a replay buffer of {capacity:,} transitions takes {columns * column / 2**20:,.0f} MiB, and {whose} "
             f"{most / 2**20:,.0f} MiB: {fitting:,} transitions fit; {remedy}"

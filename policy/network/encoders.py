@@ -173,7 +173,8 @@ def build_encoder(
         return ArrayEncoder(name, _image_encoder(spec.encoder, space, head))
     if not images:
         raise NetworkError(
-            f"the encoder {spec.encoder!r} takes images, but the observations have none: set policy.encoder to mlp"
+            f"the encoder {spec.encoder!r} takes images of bytes with at least 16 x 16 pixels, but the observations "
+            "have none: set policy.encoder to mlp"
         )
     return CompositeEncoder(images, {name: space for name, space in spaces.items() if name not in images}, spec, head)
 

@@ -346,6 +346,7 @@ def test_a_buffer_that_does_not_fit_is_refused_with_what_would() -> None:
         SettingsError, match=r"1,000,000 transitions takes .* MiB, .*: ([\d,]+) transitions fit"
     ) as refusal:
         ReplayLearner(spec_of(replay_megabytes=4.0), SPACES)
+    assert str(refusal.value).endswith(" or fewer, or raise training.replay_megabytes")
     fitting = int(str(refusal.value).split("replay_transitions=")[1].split()[0])
     ReplayLearner(spec_of(replay_megabytes=4.0, replay_transitions=fitting), SPACES)
     with pytest.raises(SettingsError, match="fit"):
