@@ -3,7 +3,7 @@
 import copy
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -65,6 +65,7 @@ class BotPlayer:
     def __init__(self, name: str, space: gymnasium.Space, modules: UserModules) -> None:
         """See make_bot."""
         self._bot = make_bot(name, space, modules, "--by")
+        self._has_choices = not isinstance(space, gymnasium.spaces.Box)
 
     def reset(self, seed: int) -> None:
         """See Player."""
@@ -72,6 +73,8 @@ class BotPlayer:
 
     def act(self, observation: Any, action_mask: Any) -> Any:
         """See Player."""
+        if self._has_choices and isinstance(observation, Mapping) and MASK_KEY in observation:
+            action_mask = observation[MASK_KEY]
         return self._bot.act(observation, action_mask)
 
 

@@ -18,6 +18,7 @@ from daedalus.cli.commands.record import record
 from daedalus.protocol.spec import EnvironmentSpec
 
 PUMP = """
+import gymnasium
 import numpy as np
 from gymnasium.envs.classic_control import CartPoleEnv
 
@@ -32,6 +33,23 @@ class Pump:
 class Unseen(CartPoleEnv):
     def render(self):
         return None
+
+class Masked(gymnasium.Env):
+    flags = gymnasium.spaces.MultiBinary(4)
+    observation_space = gymnasium.spaces.Dict({"action_mask": flags, "place": gymnasium.spaces.Discrete(4)})
+    action_space = gymnasium.spaces.Discrete(4)
+
+    def observe(self):
+        return {"action_mask": np.arange(4) == self.place, "place": self.place}
+
+    def reset(self, seed=None, options=None):
+        self.place = 1
+        return self.observe(), {}
+
+    def step(self, action):
+        assert action == self.place
+        self.place = (self.place + 1) % 4
+        return self.observe(), 1.0, self.place == 0, False, {}
 
 class Broken(CartPoleEnv):
     def step(self, action):
@@ -61,6 +79,10 @@ def test_a_bot_is_recorded_with_every_observation(recorded: Callable[..., int], 
             assert reward == earned
         assert episode.terminations[-1]
     assert dataset.total_episodes == 2
+
+
+def test_a_random_player_obeys_a_mask_in_the_observation(recorded: Callable[..., int]) -> None:
+    assert recorded("--env", "pumping:Masked", "--by", "random", "--episodes", 3) == 0
 
 
 class OneArray(gymnasium.Env):
