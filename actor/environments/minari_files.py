@@ -23,7 +23,7 @@ import numpy as np
 
 from daedalus.actor.environments.components import LeftOut, dtype_misfit, is_text, leaves, nested, without
 from daedalus.policy.saving.regular_files import read_regular, replace_text
-from daedalus.protocol.spaces import unfit_number
+from daedalus.protocol.spaces import LARGEST_REWARD, unfit_number
 from daedalus.protocol.texts import bounded_text
 
 if TYPE_CHECKING:
@@ -406,8 +406,9 @@ class MinariWriter:
         steps = len(episode.rewards)
         ends = np.zeros((2, steps), np.bool_)
         ends[:, -1] = episode.terminated, episode.truncated
-        if not np.isfinite(episode.rewards).all():
-            raise DatasetError(f"dataset {self._name}: an episode has a reward that is not finite, and is not written")
+        if not (np.abs(episode.rewards) <= LARGEST_REWARD).all():  # false for nan, too
+            reason = f"an episode has a reward that is not finite or beyond +-{LARGEST_REWARD:g}, and is not written"
+            raise DatasetError(f"dataset {self._name}: {reason}")
         buffer = EpisodeBuffer(
             seed=seed,
             observations=self._as_written(0, episode.observations, "observation"),
@@ -436,7 +437,9 @@ class MinariWriter:
                 misfit = f"has the shape {array.shape[1:]}, not {leaf.space.shape}"
             elif array.nbytes > _EPISODE_BYTES:
                 misfit = f"has {array.nbytes:,} bytes, of which an episode may have {_EPISODE_BYTES:,}"
-            if misfit := misfit or unfit_number(array.astype(np.float64, copy=False)):
+            if array.dtype == np.float16:  # has no number as large as the limit
+                array = array.astype(np.float32)
+            if misfit := misfit or unfit_number(array):
                 where = f"{what} {leaf.name!r}" if leaf.path else what
                 reason = f"an episode is not written, because its {where} {misfit}"
                 raise DatasetError(bounded_text(f"dataset {self._name}: {reason}", 500))
