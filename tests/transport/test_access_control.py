@@ -406,8 +406,10 @@ def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path) -> No
         connect([address], load(certificates / "actor-box", "actor"))
 
 
-def test_gateway_certificate_is_neither_a_learners_nor_a_clients(certificates: Path) -> None:
+def test_gateway_certificate_is_neither_a_learners_nor_a_clients(certificates: Path, tmp_path: Path) -> None:
     """Not even on the learner's own host: gateways have another CA, which no actor and no listener trusts."""
+    # A copy: what is issued changes the files of the router at `address`, which would close all its connections.
+    certificates = shutil.copytree(certificates, tmp_path / "certs")
     change_certificates(certificates, "issue gateway")
     folder = certificates / "gateway"
     with pytest.raises(CredentialsError, match="holds the certificate of gateway, but learner is required"):
