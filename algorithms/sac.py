@@ -1,14 +1,12 @@
 """Soft actor-critic: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", algorithm 1, with the
-critics of Kuznetsov et al. (2020), "Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional
-Quantile Critics" (TQC). For a choice in place of continuous actions: Christodoulou (2019), "Soft Actor-Critic for
+critics of Bhatt et al. (2024), "CrossQ: Batch Normalization in Deep Reinforcement Learning for Greater Sample
+Efficiency and Simplicity". For a choice in place of continuous actions: Christodoulou (2019), "Soft Actor-Critic for
 Discrete Action Settings".
 
 The critics stay in the learner: the program and the snapshots of the actors are the policy alone.
 """
 
-import copy
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,21 +27,28 @@ from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 
-QUANTILES = 25  # of each critic of continuous actions, as published
 _FEATURES = 50  # of each image
-DROPPED = 4  # the largest of those of both target critics
+_DECAY = 0.99  # of the running moments, at each update
+_EPSILON = 1e-3  # added to variances, as published
+POLICY_PERIOD = 3  # updates of the critics for one of the policy and the temperature, as published
+FIRST_DECAY = 0.5  # of Adam, as published: with 0.9 HalfCheetah learns more slowly than with target critics
 
 
 class TwinCritics(nn.Module):
-    """Two critics with layers of their own, computed at once, and one encoder of images.
+    """Two critics Q_1(s, a) and Q_2(s, a) with layers of their own, computed at once, and one encoder of images.
 
-    Continuous actions are inputs, and the outputs are quantiles of the return. For a choice, the outputs are the values
-    Q_1(s, a) and Q_2(s, a) of all its actions. The convolutions of images are the critics': the policy has a copy of
-    them.
+    Continuous actions are inputs. For a choice, the outputs are the values of all its actions. The convolutions of
+    images are the critics': the policy has a copy of them.
+
+    The inputs of each layer are normalised over a batch: by the moments of the batch, where the critics learn, and else
+    by running moments.
 
     Attributes:
       choices: A, the number of actions of the choice; 0 if the actions are continuous.
+      moments: [2, 2, N] of the inputs of all layers side by side: running mean and variance for each critic.
     """
+
+    moments: Tensor
 
     def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules) -> None:
         """Construct both. The layers have the sizes of `policy.hidden`; see `build_encoder` for the exceptions."""
@@ -54,11 +59,16 @@ class TwinCritics(nn.Module):
         choice = spaces.only_choice
         self.choices = 0 if choice is None else choice.choices
         actions = 0 if choice is not None else sum(space.size for space in spaces.actions.values())
-        sizes = [self.encoder.features + actions, *spec.hidden, self.choices or QUANTILES]
-        pairs = list(itertools.pairwise(sizes))
+        self._widths = [self.encoder.features + actions, *spec.hidden]
+        pairs = list(zip(self._widths, [*spec.hidden, self.choices or 1], strict=True))
         # As torch initialises linear layers; [2, inputs, outputs] and [2, 1, outputs].
         self.weights = nn.ParameterList([_uniform(inputs, (2, inputs, outputs)) for inputs, outputs in pairs])
         self.biases = nn.ParameterList([_uniform(inputs, (2, 1, outputs)) for inputs, outputs in pairs])
+        # Of the normalised inputs of each layer: [2, inputs, 1] and [2, 1, inputs].
+        self.factors = nn.ParameterList([nn.Parameter(torch.ones(2, inputs, 1)) for inputs in self._widths])
+        self.offsets = nn.ParameterList([nn.Parameter(torch.zeros(2, 1, inputs)) for inputs in self._widths])
+        moments = torch.stack([torch.zeros(2, sum(self._widths)), torch.ones(2, sum(self._widths))])
+        self.register_buffer("moments", moments)
         self._activate = torch.relu if spec.activation == "relu" else torch.tanh
 
     def convolve(self, prepared: Components) -> Components:
@@ -66,31 +76,50 @@ class TwinCritics(nn.Module):
         encoders = image_encoders(self.encoder)
         return prepared | {name: encoder.convolve(prepared[name], shifted=True) for name, encoder in encoders.items()}
 
-    def forward(self, prepared: Components, actions: Tensor) -> Tensor:
-        """Return quantiles [2, B, Q] of the returns after actions [B, D] in observations, or the values [2, B] of
-        chosen actions [B, 1]. The observations are each [B, *stacked_shape] or convolved."""
-        if self.choices:
-            return self.of_choices(prepared).gather(-1, actions.long().expand(2, *actions.shape)).squeeze(-1)
-        return self._outputs(torch.cat([self.encoder(prepared).float(), actions], -1))
+    def inputs(self, prepared: Components, actions: Tensor) -> Tensor:
+        """Return the inputs [B, N_1] of the first layers, of observations, each [B, *stacked_shape] or convolved.
 
-    def of_choices(self, prepared: Components) -> Tensor:
-        """Return both values of all A actions of a choice [2, B, A] in observations, which are as in `forward`."""
-        return self._outputs(self.encoder(prepared).float())
+        `actions`: [B, D]; those of a choice are no inputs.
+        """
+        features = self.encoder(prepared).float()
+        return features if self.choices else torch.cat([features, actions], -1)
 
-    def _outputs(self, features: Tensor) -> Tensor:
-        """Return the outputs [2, B, F'] of all layers, of [B, F]; of the last in full precision, as in ActorCritic."""
-        hidden = features.expand(2, *features.shape)
-        *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
-        for inner_weight, inner_bias in layers:
-            hidden = self._activate(torch.baddbmm(inner_bias, hidden, inner_weight))
-        with full_precision(hidden):
-            return torch.baddbmm(bias, hidden.float(), weight)
+    def forward(self, inputs: Tensor, moments: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the values [2, B, A], A = 1 for continuous actions, and moments as in `moments`.
 
-    def rounded(self) -> "TwinCritics":
-        """Return a copy in bfloat16, but for the last layer, which both share."""
-        copied = copy.deepcopy(self).bfloat16()
-        copied.weights[-1], copied.biases[-1] = self.weights[-1], self.biases[-1]
-        return copied
+        Args:
+          inputs: a result of `inputs`.
+          moments: to normalise by; None: by those of the batch, which are returned.
+        """
+        hidden = inputs.expand(2, *inputs.shape)
+        used, last = [], len(self.weights) - 1
+        given = [None] * len(self._widths) if moments is None else moments.split(self._widths, -1)
+        layers = zip(self.weights, self.biases, self.factors, self.offsets, given, strict=True)
+        for number, (weight, bias, factor, offset, known) in enumerate(layers):
+            if known is None:
+                known = _moments(hidden)
+            used.append(known)
+            mean, variance = known.unbind()
+            # The normalisation of the inputs is a change of weight and bias, which are smaller than a batch of inputs.
+            with full_precision(hidden):
+                scale = factor * (variance + _EPSILON).rsqrt()[..., None]  # [2, N_k, 1]
+                bias = torch.baddbmm(bias, offset - mean[:, None] * scale.mT, weight)
+                weight = scale * weight
+                if number == last:  # in full precision, as in ActorCritic
+                    hidden = torch.baddbmm(bias, hidden.float(), weight)
+            if number < last:
+                hidden = self._activate(torch.baddbmm(bias, hidden, weight))
+        return hidden, torch.cat(used, -1)
+
+
+def _moments(values: Tensor) -> Tensor:
+    """Return mean and variance over B rows [2, 2, N] of values [2, B, N]."""
+    with full_precision(values):
+        values = values.float()
+        # A product takes a fourth of the time of a sum over the rows.
+        share = values.new_full((1, 1, values.shape[1]), 1.0 / values.shape[1]).expand(2, -1, -1)
+        mean = share @ values
+        return torch.stack([mean, share @ (values - mean).square()]).squeeze(2)
 
 
 def _few_features(inputs: int) -> tuple[nn.Module, int]:
@@ -112,105 +141,91 @@ ENTROPY_SHARE = 0.7
 
 
 class Sac(Algorithm):
-    """Twin critics with target critics, a policy, and a temperature alpha that keeps the entropy of the policy.
+    """Twin critics, a policy, and a temperature alpha that keeps the entropy of the policy.
 
-    The value of a policy is V(s) = E[Q(s, a) - alpha log pi(a | s)], a ~ pi(s). With a transition of m rewards R and
-    discounts d (replay_buffer.py), both critics regress on R + d V-(s'), where V- has the target critics; the policy
-    ascends V(s); and log alpha descends log alpha (E[-log pi(a | s)] - H), where H is the target of the entropy. All
-    three gradients are those at the parameters before the update.
+    The value of a policy is V(s) = E[min_i Q_i(s, a) - alpha log pi(a | s)], a ~ pi(s). With a transition of m rewards
+    R and discounts d (replay_buffer.py), both critics regress on R + d V(s'), which is constant; the policy ascends
+    V(s); and log alpha descends log alpha (E[-log pi(a | s)] - H), where H is the target of the entropy. All three
+    gradients are those at the parameters before the update.
+
+    There are no target critics: the values of (s, a) and of (s', a') are computed as one batch, by whose moments all
+    inputs of layers are normalised (section 3 of CrossQ). The policy ascends values that are normalised by running
+    moments.
 
     Continuous actions are squashed Gaussian: each expectation is one reparameterised sample, and H = -D, of the actions
-    scaled to [-1, 1]. Q is the mean of all quantiles of both critics. The critics regress on the quantiles of both
-    target critics without the largest of them, so that values are not too high (section 3 of TQC).
-
-    For a choice of A actions an expectation is the sum over all of them, Q is the smaller of both values, and H a share
-    of log A.
+    scaled to [-1, 1]. For a choice of A actions an expectation is the sum over all of them, and H a share of log A.
     """
 
     record = ALGORITHMS["sac"]
 
-    def build(self, critics: TwinCritics, network: ActorCritic, *, target_rate: float, is_mixed: bool) -> None:
+    def build(self, critics: TwinCritics, network: ActorCritic, *, is_mixed: bool) -> None:
         """Begin with these critics, and a temperature of 1, before the first update.
 
         Args:
           critics: on the device of the network.
           network: the policy.
-          target_rate: share of the way that the target critics move to the critics at each update.
           is_mixed: whether forward passes compute in bfloat16.
         """
-        self._network, self._critics = network, critics
-        self._target_critics = copy.deepcopy(critics).requires_grad_(False)
+        self._network, self._critics, self._is_mixed = network, critics, is_mixed
         self._flat = FlatParameters(critics.parameters())
         device = self._flat.values.device
-        self._targets = FlatParameters(self._target_critics.parameters()).values
         self._convolutions = [
-            (part.convolutions, of_critics.convolutions, of_targets.convolutions)
-            for part, of_critics, of_targets in zip(
-                *(image_encoders(each.encoder).values() for each in (network, critics, self._target_critics)),
-                strict=True,
+            (of_policy.convolutions, of_critics.convolutions)
+            for of_policy, of_critics in zip(
+                *(image_encoders(each.encoder).values() for each in (network, critics)), strict=True
             )
         ]
         self.take_convolutions()
         self._log_temperature = torch.zeros(1, device=device)
         choices, count = critics.choices, self.distribution.normal_count  # A or 0, D or 0
         self._target_entropy = ENTROPY_SHARE * math.log(choices) if choices else -float(count)
-        self._target_rate, self._is_mixed = target_rate, is_mixed
+        self._batch_moments = critics.moments.clone()  # of the newest minibatch
         self._recorders = OperationRecorder(), OperationRecorder()
         self._records = device.type == "cpu" and not network.convolutional and not network.has_user_modules
         self._thread = ThreadPoolExecutor(1, "policy-gradient")  # beside that of the critics, if both are recorded
-        self._encoder = network.encoder
-        self._rounded: dict[nn.Parameter, nn.Parameter] = {}  # what computes in bfloat16, by what it is rounded from
-        if is_mixed and self._records:
-            # Copies that are rounded once for each update: autocast rounds at each use, and in both directions.
-            modules = (critics, self._target_critics, network.encoder)
-            copies = (critics.rounded(), self._target_critics.rounded(), copy.deepcopy(network.encoder).bfloat16())
-            for module, copied in zip(modules, copies, strict=True):
-                pairs = zip(module.parameters(), copied.parameters(), strict=True)
-                self._rounded |= {one: other for one, other in pairs if one is not other}
-            self._critics, self._target_critics, self._encoder = copies
-        self._policy_parameters = [self._rounded.get(each, each) for each in network.learned_parameters()]
-        self._critic_parameters = [self._rounded.get(each, each) for each in critics.parameters()]
         # What optimisers change, besides the policy.
         self.learned = {"critics": self._flat.values, "log_temperature": self._log_temperature}
-        self.statistics = {**self.learned, "target_critics": self._targets}
+        self.statistics = {**self.learned, "moments": critics.moments}
 
     def take_convolutions(self) -> None:
-        """Give the critics and their targets the convolutions of the policy."""
-        for of_policy, *others in self._convolutions:
-            for each in others:
-                _copy(of_policy, each)
+        """Give the critics the convolutions of the policy."""
+        for of_policy, of_critics in self._convolutions:
+            _copy(of_policy, of_critics)
 
     @property
     def temperature(self) -> float:
         """Alpha, the weight of the entropy of the policy."""
         return math.exp(float(self._log_temperature))
 
-    def gradients(self, transitions: Transitions) -> tuple[dict[str, Tensor], list[Tensor]]:
-        """Return the gradients of one update, by the names in `learned` and "policy", and its loss terms (Terms)."""
+    def gradients(self, transitions: Transitions, *, of_policy: bool = True) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """Return the gradients of one update, by the names in `learned` and "policy", and its loss terms (Terms).
+
+        With `of_policy` False, return that of the critics alone, and no terms.
+        """
         now, then, *others = transitions
         shape = 2 * len(transitions.rewards), self.distribution.normal_count
         noise = torch.randn(shape, device=transitions.rewards.device)
         noise, next_noise = noise.chunk(2)
-        for values, rounded in self._rounded.items():
-            rounded.data.copy_(values)
         if self._records:
-            results = self._recorded(now, then, [*others, next_noise], noise)
+            results = self._recorded(now, then, [*others, next_noise], noise if of_policy else None)
         else:
             with self._precision():
                 seen = self._critics.convolve(self._network.prepare(now))
             actions, rewards, discounts = others
-            prepared = self._network.prepare(then)
-            of_critics = self._of_critics(seen, prepared, actions, rewards, discounts, next_noise)
-            # The policy does not change the convolutions.
-            results = (of_critics, self._of_policy(map_components(seen, Tensor.detach), noise))
-        (critics, value_loss), (policy, temperature, policy_loss, entropy) = results
+            results = [self._of_critics(seen, self._network.prepare(then), actions, rewards, discounts, next_noise)]
+            if of_policy:  # it does not change the convolutions
+                results.append(self._of_policy(map_components(seen, Tensor.detach), noise))
+        critics, value_loss, self._batch_moments = results[0]
+        if not of_policy:
+            return {"critics": critics}, []
+        policy, temperature, policy_loss, entropy = results[1]
         terms = [policy_loss, value_loss, entropy, entropy.new_zeros(())]
         return {"policy": policy, "critics": critics, "log_temperature": temperature}, terms
 
     def _recorded(
-        self, now: Components, then: Components, others: Sequence[Tensor], noise: Tensor
+        self, now: Components, then: Components, others: Sequence[Tensor], noise: Tensor | None
     ) -> list[tuple[Tensor, ...]]:
-        """Return the results of `_of_critics` and `_of_policy`: by recordings, which two threads repeat at once."""
+        """Return the results of `_of_critics`, and with noise those of `_of_policy`: by recordings, on two threads."""
         names, size = tuple(now), len(now)
 
         def seen(values: Sequence[Tensor]) -> Components:
@@ -222,100 +237,79 @@ class Sac(Algorithm):
         def of_policy(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
             return self._of_policy(seen(tensors[:size]), tensors[size])
 
-        calls = [
-            functools.partial(recorder.call, names, function, tensors)
-            for recorder, function, tensors in (
-                (self._recorders[0], of_critics, [*now.values(), *then.values(), *others]),
-                (self._recorders[1], of_policy, [*now.values(), noise]),
-            )
-        ]
-        if not all(recorder.has_recordings for recorder in self._recorders):
-            return [call() for call in calls]
-        beside = self._thread.submit(calls[1])
-        return [calls[0](), beside.result()]
+        first, second = self._recorders
+        inputs = [*now.values(), *then.values(), *others]
+        if noise is None:
+            return [first.call(names, of_critics, inputs)]
+        call = functools.partial(second.call, names, of_policy, [*now.values(), noise])
+        if not (first.has_recordings and second.has_recordings):
+            return [first.call(names, of_critics, inputs), call()]
+        beside = self._thread.submit(call)
+        return [first.call(names, of_critics, inputs), beside.result()]
 
     def _of_critics(
         self, now: Components, then: Components, actions: Tensor, rewards: Tensor, discounts: Tensor, noise: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return the gradient of the critics, and half the squared errors of their values (means of quantiles)."""
+        """Return the gradient of the critics, their loss, and the moments of the minibatch."""
+        critics = self._critics
         with self._precision():
             with torch.no_grad():
-                by_targets = self._target_critics.convolve(then)
-                following, _ = self._values(self._target_critics, by_targets, self._critics.convolve(then), noise)
-                if not self._critics.choices:
-                    pooled = following.transpose(0, 1).flatten(1)
-                    kept = pooled.topk(2 * QUANTILES - DROPPED, largest=False, sorted=False)
-                    following = kept.values.T  # [M, B]
+                then = critics.convolve(then)
+                next_actions, log_probs = self._played(then, noise)
+            outputs, moments = critics(torch.cat([critics.inputs(now, actions), critics.inputs(then, next_actions)]))
+            values, next_values = outputs.chunk(2, 1)  # [2, B, A]
+            with torch.no_grad():
+                following, _ = self._values(next_values, log_probs)
                 targets = rewards + discounts * following
-            values = self._critics(now, actions)
-            if self._critics.choices:
-                loss = value_loss = 0.5 * (values - targets).square().mean(-1).sum()
-            else:
-                loss = quantile_loss(values, targets.T)
-                value_loss = 0.5 * (values.mean(-1) - targets.mean(0)).square().mean(-1).sum()
-        return _differentiated(loss, self._critic_parameters), value_loss.detach()
+            values = values.gather(-1, actions.long().expand(2, -1, -1)) if critics.choices else values
+            loss = 0.5 * (values.squeeze(-1) - targets).square().mean(-1).sum()
+        return _differentiated(loss, list(critics.parameters())), loss.detach(), moments.detach()
 
     def _of_policy(self, now: Components, noise: Tensor) -> tuple[Tensor, ...]:
         """Return the gradients of the policy and of the temperature, the loss and the entropy of the policy."""
+        critics = self._critics
         with self._precision():
-            values, entropies = self._values(self._critics, now, now, noise)
+            actions, log_probs = self._played(now, noise)
+            outputs, _ = critics(critics.inputs(now, actions), critics.moments)
+            values, entropies = self._values(outputs, log_probs)
             loss = -values.mean()
-        gradient = _differentiated(loss, self._policy_parameters)
+        gradient = _differentiated(loss, self._network.learned_parameters())
         entropy = entropies.detach().mean()
         return gradient, (entropy - self._target_entropy).reshape(1), loss.detach(), entropy
 
-    def _values(
-        self, critics: TwinCritics, seen: Components, prepared: Components, noise: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the values V(s) by some critics, and the entropies of the policy [B].
-
-        The values are [B] of a choice; of continuous actions [2, B, Q], one for each quantile in place of Q(s, a).
+    def _played(self, seen: Components, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Return actions of the policy [B, D] and their log-probabilities [B]; [B, 0] and those of all choices [B, A].
 
         Args:
-          critics: the critics or their targets.
-          seen: observations, with images convolved by `critics`.
-          prepared: the same, with images convolved for the policy.
+          seen: observations, with images convolved.
           noise: [B, D], of the samples of continuous actions.
         """
-        features = self._encoder(prepared).float()
-        if critics.choices:
-            with full_precision(features):
-                log_probs = self._network.policy_head(features).log_softmax(-1)  # [B, A]: its outputs are the logits
-            first, second = critics.of_choices(seen).unbind()
-            values = (log_probs.exp() * torch.minimum(first, second)).sum(-1)
+        features = self._network.encoder(seen).float()
+        with full_precision(features):
+            parameters = self._network.policy_head(features)  # of a choice, the logits
+            if self._critics.choices:
+                return noise, parameters.log_softmax(-1)
+            return self.distribution.sample_and_log_prob(parameters, noise)
+
+    def _values(self, outputs: Tensor, log_probs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the values V(s) and the entropies of the policy, each [B], of outputs of the critics [2, B, A]."""
+        smaller = torch.minimum(*outputs.unbind())
+        if self._critics.choices:
             entropies = -(log_probs.exp() * log_probs).sum(-1)
-            bonus = self._log_temperature.exp() * entropies
+            values = (log_probs.exp() * smaller).sum(-1)
         else:
-            with full_precision(features):
-                actions, log_probs = self.distribution.sample_and_log_prob(self._network.policy_head(features), noise)
-            values, entropies = critics(seen, actions), -log_probs
-            bonus = (self._log_temperature.exp() * entropies)[:, None]
-        return values + bonus, entropies
+            values, entropies = smaller.squeeze(-1), -log_probs
+        return values + self._log_temperature.exp() * entropies, entropies
 
     def _precision(self) -> AbstractContextManager[object]:
         device = self._log_temperature.device.type
         return torch.autocast(device, torch.bfloat16) if self._is_mixed else nullcontext()
 
     def after_update(self, policy_version: int, forward: Forward) -> None:
-        """See Algorithm: move the target critics by `target_rate` of the way to the critics."""
-        self._targets.lerp_(self._flat.values, self._target_rate)
-        for of_policy, of_critics, _ in self._convolutions:
+        """See Algorithm: move the running moments of the critics towards those of the minibatch."""
+        self._critics.moments.lerp_(self._batch_moments, 1.0 - _DECAY)
+        for of_policy, of_critics in self._convolutions:
             _copy(of_critics, of_policy)
-
-
-def quantile_loss(values: Tensor, targets: Tensor) -> Tensor:
-    """Return a number with the gradient of TQC's loss of quantiles [2, B, Q], for targets [B, M].
-
-    The loss is the mean over rows, quantiles and targets of |tau - 1(target < quantile)| h(target - quantile): tau
-    is the level of the quantile, h the loss of Huber with threshold 1. Those of both critics are added.
-    """
-    _, rows, quantiles = values.shape
-    with torch.no_grad():
-        clipped = (targets[:, None] - values[..., None]).clamp(-1.0, 1.0)  # [2, B, Q, M]
-        levels = (torch.arange(quantiles, device=values.device) + 0.5) / quantiles
-        # A positive error counts `levels` times, a negative one 1 - `levels` times.
-        slopes = -(0.5 * clipped.mean(-1) + (levels - 0.5) * clipped.abs().mean(-1)) / (rows * quantiles)
-    return (slopes * values).sum()
 
 
 def _differentiated(loss: Tensor, parameters: Sequence[Tensor]) -> Tensor:

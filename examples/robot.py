@@ -5,8 +5,7 @@ In the folder `examples`, show it ten times, and start the learner, on any machi
     daedalus record --env robot:Arm --by robot:Person --episodes 10 --out ./shown
     daedalus learner --env robot:Arm --algorithm sac --demonstrations ./shown --actors 1 \
         --set training.updates_per_env_step=2 --set training.n_step=5 --set training.discount_factor=0.98 \
-        --set policy.hidden=[64,64] --set training.minibatch_rows=128 --set training.learning_rate=1e-3 \
-        --set training.replay_begin=200
+        --set policy.hidden=[64,64] --set training.minibatch_rows=128 --set training.replay_begin=200
 
 In another terminal:
 

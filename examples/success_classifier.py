@@ -6,8 +6,7 @@ In the folder `examples`, record successes and failures of the arm in robot.py, 
     daedalus record --env robot:Arm --by random --episodes 20 --out ./failures
     daedalus learner --env robot:Arm --algorithm sac --demonstrations ./successes --actors 1 \
         --set training.updates_per_env_step=2 --set training.n_step=5 --set training.discount_factor=0.98 \
-        --set policy.hidden=[64,64] --set training.minibatch_rows=128 --set training.learning_rate=1e-3 \
-        --set training.replay_begin=200
+        --set policy.hidden=[64,64] --set training.minibatch_rows=128 --set training.replay_begin=200
 
 In another terminal:
 

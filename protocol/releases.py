@@ -20,6 +20,7 @@ REPLACED_SETTINGS = {
     "environment.continuing": "environment.bootstrap_terminations",
     "environment.patience": "environment.no_reward_limit",
     "service.metrics_writers": "the option --log module:Class of `daedalus train` and `daedalus learner`",
+    "training.target_rate": "no setting (`sac` has no target critics any more: remove the line)",
 }
 _MOST_DESCRIBED = 100  # faults of a model; pydantic describes all or none
 REPLACED_VALUES = {("environment.backend", "sketch"): "fast"}

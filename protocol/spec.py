@@ -373,7 +373,7 @@ class TrainingSpec(LossSpec):
     has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
     replay_transitions: PositiveInt = 1_000_000
     """Newest transitions that the replay buffer keeps, at most twice as many as `env_steps`: reset rows and those that
-    people play take room, too. `sac` only, as are the next eight settings."""
+    people play take room, too. `sac` only, as are the next seven settings."""
     replay_megabytes: Annotated[float, Field(gt=0.0)] | None = None
     """MiB of memory that the replay buffer may need: one that needs more is refused. Unset: three quarters of the
     memory that is available when the learner starts."""
@@ -392,8 +392,6 @@ class TrainingSpec(LossSpec):
     demonstration_share: UnitInterval = 0.5
     """Share of each minibatch that comes from demonstrations (`--demonstrations`) and from actions of people that
     were played in place of the policy's, where there are any."""
-    target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
-    """Share of the way that the target critics move to the critics at each update."""
     cloning_updates: NaturalInt = 1000
     """Updates before training in which the policy imitates the demonstrations (`--demonstrations`); `appo` only, as is
     the next setting."""

@@ -19,7 +19,6 @@ _CHECKPOINT_SECONDS = 5  # what a learner that is killed may lose
 _TASK = ("--env", f"{MODULE}:SlowReacher-v0", "--allow-module", MODULE, "--algorithm", "sac", "--run-dir", "run")
 _SETTINGS = (
     "policy.hidden=[64,64]",
-    "training.learning_rate=1e-3",
     "training.replay_begin=200",
     "training.target_episodes=24",
     f"service.checkpoint_seconds={_CHECKPOINT_SECONDS}",

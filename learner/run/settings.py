@@ -326,7 +326,7 @@ def unread_settings(spec: RunSpec, spaces: Spaces | None = None) -> set[str]:
         "training.entropy_bonus training.entropy_bonus_final training.normalize_advantages": has_returns,
         "training.mean_first_value": has_returns and not spec.uploads_gradients,
         "training.replay_transitions training.replay_megabytes training.replay_saved training.replay_begin "
-        "training.updates_per_env_step training.minibatch_rows training.n_step training.target_rate "
+        "training.updates_per_env_step training.minibatch_rows training.n_step "
         "training.demonstration_share": record.replay,
         "training.cloning_updates training.cloning_weight": record.demonstrations and not record.replay,
         "training.rmsprop_decay": training.optimizer == "rmsprop",

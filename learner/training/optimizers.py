@@ -13,6 +13,7 @@ from torch import Tensor
 
 from daedalus.algorithms.forward import FlatParameters
 from daedalus.algorithms.gradients import Terms
+from daedalus.algorithms.sac import FIRST_DECAY
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.protocol.spec import TrainingSpec
 
@@ -34,12 +35,12 @@ class Optimizer(Protocol):
 
 
 class Adam:
-    """Adam: Kingma & Ba (2015), algorithm 1, with decays of 0.9 and 0.999. Uses torch's fused kernel."""
+    """Adam: Kingma & Ba (2015), algorithm 1, with decays of 0.9, or another, and 0.999. Uses torch's fused kernel."""
 
-    _FIRST, _SECOND = 0.9, 0.999
+    _SECOND = 0.999
 
-    def __init__(self, values: Tensor, epsilon: float) -> None:
-        self._epsilon = epsilon
+    def __init__(self, values: Tensor, epsilon: float, first_decay: float = 0.9) -> None:
+        self._epsilon, self._first = epsilon, first_decay
         self.statistics = {
             "mean": torch.zeros_like(values),
             "square": torch.zeros_like(values),
@@ -58,7 +59,7 @@ class Adam:
             [],
             [statistics["steps"]],
             lr=learning_rate,
-            beta1=self._FIRST,
+            beta1=self._first,
             beta2=self._SECOND,
             weight_decay=0.0,
             eps=self._epsilon,
@@ -92,6 +93,8 @@ class RmsProp:
 def build_optimizer(spec: TrainingSpec, values: Tensor) -> Optimizer:
     """Return the optimiser named by `spec.optimizer`, for a vector of parameters [P]."""
     if spec.optimizer == "adam":
+        if spec.record.replay:
+            return Adam(values, spec.optimizer_epsilon, FIRST_DECAY)
         return Adam(values, spec.optimizer_epsilon)
     return RmsProp(values, spec.optimizer_epsilon, spec.rmsprop_decay)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from daedalus.algorithms.gradients import Terms, is_mixed
 from daedalus.algorithms.replay_buffer import ReplayBuffer, Transitions, joined
-from daedalus.algorithms.sac import Sac, TwinCritics
+from daedalus.algorithms.sac import POLICY_PERIOD, Sac, TwinCritics
 from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
@@ -45,7 +45,7 @@ class ReplayLearner(Learner):
         assert isinstance(algorithm, Sac)
         mixed = is_mixed(spec.precision, self.device, self._network.convolutional)
         critics = TwinCritics(run.policy, spaces, modules).to(self.device)
-        algorithm.build(critics, self._network, target_rate=spec.target_rate, is_mixed=mixed)
+        algorithm.build(critics, self._network, is_mixed=mixed)
         self._algorithm = algorithm
         self._learned = {"policy": self._flat.values, **algorithm.learned}
         self._optimizers = {
@@ -134,7 +134,8 @@ class ReplayLearner(Learner):
         """Make one update, or skip it if a gradient is not finite."""
         spec = self._spec
         transitions = self._sampled(spec.minibatch_rows)
-        gradients, terms = self._algorithm.gradients(_moved(transitions, self.device))
+        of_policy = self.policy_version % POLICY_PERIOD == 0
+        gradients, terms = self._algorithm.gradients(_moved(transitions, self.device), of_policy=of_policy)
         norms = {name: float(torch.linalg.vector_norm(gradient)) for name, gradient in gradients.items()}
         self.policy_version += 1
         if not all(map(math.isfinite, norms.values())):
@@ -146,8 +147,9 @@ class ReplayLearner(Learner):
                 gradient = gradient * (spec.max_gradient_norm / norms[name])
             self._optimizers[name].step(self._learned[name], gradient, rate, made)
         self._gradients.after_update(self.policy_version)
-        self.metrics.add_update(Terms(*terms), rate.new_tensor(math.hypot(*norms.values())))
-        self.metrics.count_updates(1)
+        if terms:
+            self.metrics.add_update(Terms(*terms), rate.new_tensor(math.hypot(*norms.values())))
+            self.metrics.count_updates(1)
 
     def _sampled(self, rows: int) -> Transitions:
         """Return a minibatch, with its share of demonstrations: Ball et al. (2023), "Efficient Online Reinforcement

@@ -9,11 +9,10 @@ from torch import Tensor, nn
 from torch import distributions as reference
 from torch.nn import functional
 
-from daedalus.algorithms.forward import FlatParameters
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.recording import EARLIER_CALLS
 from daedalus.algorithms.replay_buffer import Transitions
-from daedalus.algorithms.sac import DROPPED, ENTROPY_SHARE, QUANTILES, Sac, TwinCritics, quantile_loss
+from daedalus.algorithms.sac import ENTROPY_SHARE, Sac, TwinCritics
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.convolutional import ImageEncoder, ImageLayout
 from daedalus.policy.network.distributions import SquashedGaussian
@@ -51,17 +50,13 @@ class Built:
         assert isinstance(computer.algorithm, Sac)
         self.sac = computer.algorithm
         self.critics = TwinCritics(POLICY, spaces, NO_MODULES)
-        self.sac.build(self.critics, self.network, target_rate=spec.target_rate, is_mixed=is_mixed)
-        self.sac.statistics["target_critics"].add_(torch.randn_like(self.sac.statistics["target_critics"]) * 0.1)
+        self.sac.build(self.critics, self.network, is_mixed=is_mixed)
+        for parameter in (*self.critics.factors, *self.critics.offsets):
+            parameter.data.add_(torch.randn_like(parameter) * 0.3)
+        mean, variance = self.sac.statistics["moments"].unbind()
+        mean.normal_(std=0.3)
+        variance.uniform_(0.5, 2.0)
         self.sac.learned["log_temperature"].fill_(math.log(0.3))
-
-    @property
-    def targets(self) -> TwinCritics:
-        """The target critics."""
-        critics = TwinCritics(POLICY, self.spaces, NO_MODULES)
-        values = FlatParameters(critics.parameters()).values
-        values.copy_(self.sac.statistics["target_critics"])
-        return critics
 
 
 def transitions(seed: int = 3, spaces: Spaces = SPACES) -> Transitions:
@@ -76,15 +71,29 @@ def transitions(seed: int = 3, spaces: Spaces = SPACES) -> Transitions:
     )
 
 
-def value(critics: TwinCritics, which: int, *parts: Tensor) -> Tensor:
-    """The outputs of a critic for one observation, and one action if it is continuous, layer by layer."""
-    inputs = torch.cat(parts)
-    layers = list(zip(critics.weights, critics.biases, strict=True))
-    for index, (weight, bias) in enumerate(layers):
-        inputs = inputs @ weight[which] + bias[which, 0]
-        if index < len(layers) - 1:
-            inputs = inputs.clamp(min=0.0)
-    return inputs
+def normalised(inputs: Tensor, moments: tuple[Tensor, Tensor]) -> Tensor:
+    mean, variance = moments
+    return (inputs - mean) / (variance + 1e-3).sqrt()
+
+
+def by_batch(rows: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Mean and variance of the inputs of a layer over the rows of a minibatch."""
+    mean = sum(rows, torch.zeros(())) / len(rows)
+    return mean, sum(((row - mean) ** 2 for row in rows), torch.zeros(())) / len(rows)
+
+
+def values(critics: TwinCritics, which: int, rows: list[Tensor], running: Tensor | None = None) -> list[Tensor]:
+    """The outputs of a critic for rows of inputs, layer by layer; normalised by the rows, or by running moments."""
+    first = 0
+    for index, (weight, bias) in enumerate(zip(critics.weights, critics.biases, strict=True)):
+        if index:
+            rows = [row.clamp(min=0.0) for row in rows]
+        last = first + len(rows[0])
+        known = by_batch(rows) if running is None else (running[0, which, first:last], running[1, which, first:last])
+        factor, offset = critics.factors[index][which, :, 0], critics.offsets[index][which, 0]
+        rows = [(factor * normalised(row, known) + offset) @ weight[which] + bias[which, 0] for row in rows]
+        first = last
+    return rows
 
 
 def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,19 +111,11 @@ def chosen(network: ActorCritic, observation: Tensor, noise: Tensor) -> tuple[Te
     return action, squashed.log_prob(action).sum()
 
 
-def check(
-    built: Built,
-    gradients: dict[str, Tensor],
-    terms: list[Tensor],
-    losses: list[Tensor],
-    target: float,
-    quantiles: Tensor | None = None,
-) -> None:
-    """Compare gradients and terms with the losses of the critics (of their values and of their quantiles) and of the
-    policy, and with the entropy."""
+def check(built: Built, gradients: dict[str, Tensor], terms: list[Tensor], losses: list[Tensor], target: float) -> None:
+    """Compare gradients and terms with the losses of the critics and of the policy, and with the entropy."""
     value_loss, policy_loss, entropy = losses
     for name, loss, parameters in (
-        ("critics", value_loss if quantiles is None else quantiles, list(built.critics.parameters())),
+        ("critics", value_loss, list(built.critics.parameters())),
         ("policy", policy_loss, built.network.learned_parameters()),
     ):
         expected = torch.cat([each.flatten() for each in torch.autograd.grad(loss, parameters)])
@@ -125,83 +126,74 @@ def check(
 
 
 def test_gradients_are_those_of_the_papers_losses() -> None:
-    built, batch = Built(), transitions()
+    """Both observations of all transitions are one batch of the critics, and the targets are constants."""
+    built, batch, alpha = Built(), transitions(), 0.3
     torch.manual_seed(5)
     noise = torch.randn(2 * ROWS, 3)
     torch.manual_seed(5)
     gradients, terms = built.sac.gradients(batch)
-    alpha, targets = 0.3, built.targets
-    value_loss, loss, policy_loss, entropy = (torch.zeros(()) for _ in range(4))
+    now, then, moments = batch.observations["o"], batch.next_observations["o"], built.sac.statistics["moments"]
+    following = [chosen(built.network, then[row], noise[ROWS + row]) for row in range(ROWS)]
+    own = [chosen(built.network, now[row], noise[row]) for row in range(ROWS)]
+    played = [torch.cat([now[row], batch.actions[row]]) for row in range(ROWS)]
+    next_played = [torch.cat([then[row], following[row][0].detach()]) for row in range(ROWS)]
+    of_batch = [values(built.critics, which, played + next_played) for which in range(2)]
+    own_played = [torch.cat([now[row], own[row][0]]) for row in range(ROWS)]
+    of_policy = [values(built.critics, which, own_played, moments) for which in range(2)]
+    value_loss, policy_loss, entropy = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for row in range(ROWS):
-        now, then = batch.observations["o"][row], batch.next_observations["o"][row]
-        with torch.no_grad():
-            action, log_prob = chosen(built.network, then, noise[ROWS + row])
-            pooled = sorted(float(each) for which in range(2) for each in value(targets, which, then, action))
-            kept = torch.tensor(pooled[: 2 * QUANTILES - DROPPED])
-            y = batch.rewards[row] + batch.discounts[row] * (kept - alpha * log_prob)
-        for which in range(2):
-            quantiles = value(built.critics, which, now, batch.actions[row])
-            value_loss = value_loss + 0.5 * (quantiles.mean() - y.mean()) ** 2 / ROWS
-            for number, quantile in enumerate(quantiles):
-                level, errors = (number + 0.5) / QUANTILES, y - quantile
-                weights = torch.where(errors < 0.0, 1.0 - level, level)
-                hubers = functional.huber_loss(quantile.expand_as(y), y, reduction="none")
-                loss = loss + (weights * hubers).mean() / (ROWS * QUANTILES)
-        action, log_prob = chosen(built.network, now, noise[row])
-        mean = torch.cat([value(built.critics, which, now, action) for which in range(2)]).mean()
-        policy_loss = policy_loss + (alpha * log_prob - mean) / ROWS
+        smaller = min(float(each[ROWS + row].detach()) for each in of_batch)
+        y = batch.rewards[row] + batch.discounts[row] * (smaller - alpha * float(following[row][1].detach()))
+        for each in of_batch:
+            value_loss = value_loss + 0.5 * ((each[row] - y) ** 2).sum() / ROWS
+        log_prob = own[row][1]
+        policy_loss = policy_loss + (alpha * log_prob - torch.minimum(*(each[row] for each in of_policy)).sum()) / ROWS
         entropy = entropy - log_prob.detach() / ROWS
-    check(built, gradients, terms, [value_loss, policy_loss, entropy], -3.0, loss)
-
-
-def test_quantile_loss_by_hand() -> None:
-    """Levels 1/4 and 3/4 at 0.5 and 4, targets 0 and 3: the slopes are (3/4 * 0.5 - 1/4 * 1) / 2 and 1/4 * (1 + 1) / 2.
-
-    They are divided by the two quantiles.
-    """
-    values = torch.tensor([[[0.5, 4.0]], [[0.0, 0.0]]], requires_grad=True)
-    quantile_loss(values, torch.tensor([[0.0, 3.0]])).backward()
-    assert values.grad is not None
-    torch.testing.assert_close(values.grad[0, 0], torch.tensor([0.03125, 0.125]))
+    check(built, gradients, terms, [value_loss, policy_loss, entropy], -3.0)
 
 
 def test_gradients_of_a_choice_are_those_of_the_papers_losses() -> None:
     """Christodoulou (2019), equations 4, 10 and 12: each expectation over the actions is a sum."""
-    built, batch = Built(spaces=CHOICE), transitions(spaces=CHOICE)
+    built, batch, alpha = Built(spaces=CHOICE), transitions(spaces=CHOICE), 0.3
     gradients, terms = built.sac.gradients(batch)
-    alpha, targets = 0.3, built.targets
+    now, then, moments = batch.observations["o"], batch.next_observations["o"], built.sac.statistics["moments"]
+    of_batch = [values(built.critics, which, [*now, *then]) for which in range(2)]
+    of_policy = [values(built.critics, which, [*now], moments) for which in range(2)]
     value_loss, policy_loss, entropy = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for row in range(ROWS):
-        now, then = batch.observations["o"][row], batch.next_observations["o"][row]
         of_now, of_then = (
-            built.network.policy_head(built.network.encoder({"o": each[None]}))[0] for each in (now, then)
+            built.network.policy_head(built.network.encoder({"o": each[row][None]}))[0] for each in (now, then)
         )
         y = batch.rewards[row]
         for action in range(4):
             probability = (of_then[action] - of_then.logsumexp(0)).exp().detach()
-            smaller = min(value(targets, which, then)[action].detach() for which in range(2))
+            smaller = min(float(each[ROWS + row][action].detach()) for each in of_batch)
             y = y + batch.discounts[row] * probability * (smaller - alpha * probability.log())
             log_prob = of_now[action] - of_now.logsumexp(0)
-            smaller = min(value(built.critics, which, now)[action].detach() for which in range(2))
+            smaller = min(float(each[row][action].detach()) for each in of_policy)
             policy_loss = policy_loss + log_prob.exp() * (alpha * log_prob - smaller) / ROWS
             entropy = entropy - (log_prob.exp() * log_prob).detach() / ROWS
-        for which in range(2):
-            played = value(built.critics, which, now)[int(batch.actions[row, 0])]
-            value_loss = value_loss + 0.5 * (played - y) ** 2 / ROWS
+        for each in of_batch:
+            value_loss = value_loss + 0.5 * (each[row][int(batch.actions[row, 0])] - y) ** 2 / ROWS
     check(built, gradients, terms, [value_loss, policy_loss, entropy], ENTROPY_SHARE * math.log(4.0))
 
 
-def test_target_of_a_choice_by_hand() -> None:
-    """Uniform policy of four actions, Q- = (1, 2, 3, 4) and 2.5: y = r + d (mean of (1, 2, 2.5, 2.5) + alpha log 4)."""
-    built = Built(spaces=CHOICE)
-    for parameter in built.network.parameters():
+def only_biases(built: Built, biases: list[list[float]]) -> None:
+    """Let policy and critics compute 0, but for the last biases of the critics."""
+    for parameter in (*built.network.parameters(), *built.critics.parameters()):
         parameter.data.zero_()
-    for which in (built.sac.statistics["target_critics"], built.sac.learned["critics"]):
-        which.zero_()
-    built.sac.statistics["target_critics"][-8:] = torch.tensor([1.0, 2.0, 3.0, 4.0] + [2.5] * 4)  # the last biases
+    built.critics.biases[-1].data.copy_(torch.tensor(biases)[:, None])
+
+
+def test_target_of_a_choice_by_hand() -> None:
+    """Uniform policy of four actions, Q = (1, 2, 3, 4) and 2.5: y = r + d (mean of (1, 2, 2.5, 2.5) + alpha log 4)."""
+    built = Built(spaces=CHOICE)
+    only_biases(built, [[1.0, 2.0, 3.0, 4.0], [2.5] * 4])
     batch = transitions(spaces=CHOICE)._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
     _, (_, value_loss, entropy, _) = built.sac.gradients(batch)
-    assert float(value_loss) == pytest.approx((0.5 + 0.9 * (2.0 + 0.3 * math.log(4.0))) ** 2, rel=1e-5)
+    y = 0.5 + 0.9 * (2.0 + 0.3 * math.log(4.0))
+    errors = (torch.tensor([1.0, 2.0, 3.0, 4.0])[batch.actions[:, 0].long()] - y) ** 2 + (2.5 - y) ** 2
+    assert float(value_loss) == pytest.approx(float(0.5 * errors.mean()), rel=1e-5)
     assert float(entropy) == pytest.approx(math.log(4.0))
 
 
@@ -214,28 +206,52 @@ def test_temperature_of_a_choice_rises_where_the_policy_is_nearly_certain(logit:
     assert (float(gradients["log_temperature"]) < 0.0) is rises  # the optimiser descends
 
 
-def test_target_by_hand() -> None:
-    """Policy N(0, 1) before tanh, quantiles 2 and 5 of the target critics, 1 and 4 of the critics.
+def test_policy_and_temperature_are_left_out_of_an_update_of_the_critics_alone() -> None:
+    found = []
+    for of_policy in (True, False):
+        built = Built()
+        torch.manual_seed(5)
+        found.append(built.sac.gradients(transitions(), of_policy=of_policy)[0])
+    assert found[1].keys() == {"critics"}
+    torch.testing.assert_close(found[0]["critics"], found[1]["critics"])
 
-    Four of 25 quantiles 5 are dropped: the mean of y is r + d ((25 * 2 + 21 * 5) / 46 - alpha log pi(a' | s')).
-    """
+
+def test_target_by_hand() -> None:
+    """Policy N(0, 1) before tanh, critics 2 and 5: y is r + d (2 - alpha log pi(a' | s'))."""
     built = Built()
-    for parameter in built.network.parameters():
-        parameter.data.zero_()
-    for which, values in (
-        (built.sac.statistics["target_critics"], (2.0, 5.0)),
-        (built.sac.learned["critics"], (1.0, 4.0)),
-    ):
-        which.zero_()
-        which[-2 * QUANTILES :] = torch.tensor(values).repeat_interleave(QUANTILES)  # the biases of the last layer
+    only_biases(built, [[2.0], [5.0]])
     batch = transitions()._replace(rewards=torch.full((ROWS,), 0.5), discounts=torch.full((ROWS,), 0.9))
     torch.manual_seed(5)
     u = torch.randn(2 * ROWS, 3)[ROWS:].double()
     torch.manual_seed(5)
     _, (_, value_loss, *_) = built.sac.gradients(batch)
     log_prob = (-0.5 * u**2 - 0.5 * math.log(2.0 * math.pi) - torch.log(1.0 - torch.tanh(u) ** 2)).sum(-1)
-    y = 0.5 + 0.9 * ((25 * 2.0 + 21 * 5.0) / 46 - 0.3 * log_prob)
-    assert float(value_loss) == pytest.approx(float((0.5 * ((1.0 - y) ** 2 + (4.0 - y) ** 2)).mean()), rel=1e-4)
+    y = 0.5 + 0.9 * (2.0 - 0.3 * log_prob)
+    assert float(value_loss) == pytest.approx(float((0.5 * ((2.0 - y) ** 2 + (5.0 - y) ** 2)).mean()), rel=1e-4)
+
+
+def test_inputs_of_layers_are_normalised_by_hand() -> None:
+    """One layer, inputs 1 and 3 (mean 2, variance 1), factor 2, offset 1, weight 3, bias 0.5."""
+    spaces = Spaces(
+        observations={"o": ArraySpace(shape=(1,), dtype="float32")}, actions={"c": DiscreteSpace(counts=(2,))}
+    )
+    critics = TwinCritics(POLICY.model_copy(update={"hidden": ()}), spaces, NO_MODULES)
+    for parameters, number in (
+        (critics.weights, 3.0),
+        (critics.biases, 0.5),
+        (critics.factors, 2.0),
+        (critics.offsets, 1.0),
+    ):
+        parameters[0].data.fill_(number)
+    outputs, moments = critics(torch.tensor([[1.0], [3.0]]))
+    deviation = math.sqrt(1.0 + 1e-3)
+    torch.testing.assert_close(
+        outputs[0, :, 0], torch.tensor([3.0 * (1.0 - 2.0 / deviation), 3.0 * (1.0 + 2.0 / deviation)]) + 0.5
+    )
+    torch.testing.assert_close(moments, torch.tensor([2.0, 1.0])[:, None, None].expand(2, 2, 1))
+    outputs, used = critics(torch.tensor([[1.0]]), critics.moments)
+    torch.testing.assert_close(used, critics.moments)
+    torch.testing.assert_close(outputs[0, 0, 0], torch.tensor(3.0 * (2.0 / deviation + 1.0) + 0.5))
 
 
 @pytest.mark.parametrize("spaces", [SPACES, CHOICE])
@@ -258,8 +274,7 @@ def test_bfloat16_rounds_the_parameters_of_the_moment(spaces: Spaces) -> None:
     exact, rounded = Built(spaces=spaces), Built(spaces=spaces, is_mixed=True)
     for built in (exact, rounded):  # after the copies were made
         torch.manual_seed(11)
-        for values in (built.sac.statistics["critics"], built.sac.statistics["target_critics"]):
-            values.add_(torch.randn_like(values))
+        built.sac.statistics["critics"].add_(torch.randn_like(built.sac.statistics["critics"]))
         for parameter in built.network.encoder.parameters():
             parameter.data.add_(torch.randn_like(parameter))
     for _ in range(EARLIER_CALLS + 2):
@@ -272,11 +287,22 @@ def test_bfloat16_rounds_the_parameters_of_the_moment(spaces: Spaces) -> None:
             assert 0.0 < float((found[1][name] - expected).norm() / expected.norm()) < 0.05, name
 
 
-def test_target_critics_follow_the_critics() -> None:
-    built = Built(target_rate=0.25)
-    before, critics = built.sac.statistics["target_critics"].clone(), built.sac.statistics["critics"]
+def test_running_moments_follow_those_of_the_minibatches_that_were_learned_from() -> None:
+    built, batch = Built(), transitions()
+    moments = built.sac.statistics["moments"]
+    before = moments.clone()
+    torch.manual_seed(5)
+    noise = torch.randn(2 * ROWS, 3)[ROWS:]
+    torch.manual_seed(5)
+    built.sac.gradients(batch)
+    torch.testing.assert_close(moments, before, msg="a gradient that is not finite changes nothing")
     built.sac.after_update(1, GradientComputer(built.sac.spec, built.network, SPACES).forward)
-    torch.testing.assert_close(built.sac.statistics["target_critics"], 0.75 * before + 0.25 * critics)
+    following = [chosen(built.network, batch.next_observations["o"][row], noise[row])[0] for row in range(ROWS)]
+    rows = [*torch.cat([batch.observations["o"], batch.actions], -1)]
+    rows += [*torch.cat([batch.next_observations["o"], torch.stack(following)], -1)]
+    for number, (found, expected) in enumerate(zip(moments, by_batch(rows), strict=True)):
+        size = NUMBERS + 3
+        torch.testing.assert_close(found[0, :size], 0.99 * before[number, 0, :size] + 0.01 * expected)
 
 
 @pytest.mark.parametrize("mean", [0.0, 1.5, -3.9])
@@ -320,7 +346,7 @@ def test_convolutions_are_those_of_the_critics(action: ActionSpace) -> None:
     computer, critics = GradientComputer(spec, network, spaces), TwinCritics(POLICY, spaces, NO_MODULES)
     sac = computer.algorithm
     assert isinstance(sac, Sac)
-    sac.build(critics, network, target_rate=0.1, is_mixed=False)
+    sac.build(critics, network, is_mixed=False)
     ours, theirs = (image_encoders(each.encoder)["pixels"].convolutions for each in (network, critics))
 
     def same() -> bool:
@@ -330,7 +356,6 @@ def test_convolutions_are_those_of_the_critics(action: ActionSpace) -> None:
     now, then = ({"pixels": torch.randint(0, 255, (4, 2, 42, 42), dtype=torch.uint8)} for _ in range(2))
     batch = Transitions(now, then, torch.zeros(4, 1), torch.zeros(4), torch.ones(4))
     network.policy_head.weight.data.normal_()
-    sac.learned["log_temperature"].fill_(-10.0)  # so that no error is above the threshold of Huber's loss
     gradients, _ = sac.gradients(batch)
     learned = {name: each.numel() for name, each in network.named_parameters() if each.requires_grad}
     changed = {
@@ -339,23 +364,19 @@ def test_convolutions_are_those_of_the_critics(action: ActionSpace) -> None:
         if part.abs().max() > 0.0
     }
     assert changed == {name for name in learned if "convolutions" not in name}
-    sac.learned["critics"].sub_(gradients["critics"])
-    assert not same()
-    sac.after_update(1, computer.forward)
-    assert same()
 
     def seeded() -> dict[str, Tensor]:
         torch.manual_seed(7)
         return sac.gradients(batch)[0]
 
-    before = seeded()
-    parts = sac.statistics["target_critics"].split([each.numel() for each in critics.parameters()])
-    for (name, _), part in zip(critics.named_parameters(), parts, strict=True):
-        if "convolutions" in name:
-            part.add_(0.1)
+    before, _ = seeded(), critics.moments[1].mul_(2.0)
     after = seeded()
-    assert torch.equal(before["policy"], after["policy"])
-    assert not torch.equal(before["critics"], after["critics"]), "the target critics have convolutions of their own"
+    assert torch.equal(before["critics"], after["critics"]), "the critics learn with the moments of the minibatch"
+    assert not torch.equal(before["policy"], after["policy"]), "and the policy with running moments"
+    sac.learned["critics"].sub_(gradients["critics"])
+    assert not same()
+    sac.after_update(1, computer.forward)
+    assert same()
 
 
 def test_images_are_shifted_with_their_borders_repeated() -> None:

@@ -64,10 +64,10 @@ def trained(learner: ReplayLearner, *seeds: int) -> ReplayLearner:
 def test_too_little_memory_is_reported_with_the_number_of_rows_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     compute = Sac.gradients
 
-    def limited(self: Sac, transitions: Transitions) -> Any:
+    def limited(self: Sac, transitions: Transitions, **options: bool) -> Any:
         if len(transitions.rewards) > 3:
             raise torch.OutOfMemoryError("CUDA out of memory")
-        return compute(self, transitions)
+        return compute(self, transitions, **options)
 
     monkeypatch.setattr(Sac, "gradients", limited)
     with pytest.raises(SettingsError, match=r"batch of 8 rows do not fit .*; 2 rows fit: set training.minibatch_rows"):
@@ -103,16 +103,42 @@ def test_updates_change_policy_critics_and_temperature() -> None:
     trained(learner, 1, 2)
     assert learner.policy_version == 16
     assert any((learner.weights()[name] != values).any() for name, values in before.items())
-    for name in ("critics", "target_critics", "log_temperature"):
+    for name in ("critics", "moments", "log_temperature"):
         assert (learner.state()[f"algorithm/{name}"] != state[f"algorithm/{name}"]).any(), name
     assert learner.entropy_bonus(0.0) != 1.0
     assert learner.metrics.take_means()["gradient_norm"] > 0.0
 
 
-def test_half_of_each_minibatch_is_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_policy_is_updated_with_each_third_update_of_the_critics_also_after_a_resume() -> None:
+    learner = trained(ReplayLearner(spec_of(updates_per_env_step=0.125), SPACES), 0)
+    changed = []
+    for seed in range(1, 10):
+        before = {name: values.copy() for name, values in learner.weights().items()}
+        trained(learner, seed)
+        changed.append(any((learner.weights()[name] != values).any() for name, values in before.items()))
+        other = ReplayLearner(spec_of(updates_per_env_step=0.125), SPACES)
+        state = {name: values.clone() for name, values in learner.state().items()}
+        other.restore(learner.policy_version, learner.weights(), state)
+        other.replay = learner.replay
+        learner = other
+    assert changed == [True, False, False] * 3
+
+
+def sampled_rewards(monkeypatch: pytest.MonkeyPatch) -> list[torch.Tensor]:
+    """Return the rewards of each minibatch, as they come."""
     sampled: list[torch.Tensor] = []
     gradients = Sac.gradients
-    monkeypatch.setattr(Sac, "gradients", lambda sac, batch: sampled.append(batch.rewards) or gradients(sac, batch))
+
+    def observed(self: Sac, transitions: Transitions, **options: bool) -> Any:
+        sampled.append(transitions.rewards)
+        return gradients(self, transitions, **options)
+
+    monkeypatch.setattr(Sac, "gradients", observed)
+    return sampled
+
+
+def test_half_of_each_minibatch_is_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
+    sampled = sampled_rewards(monkeypatch)
     learner = ReplayLearner(spec_of(), SPACES)
     learner.demonstrations = ReplayBuffer(SPACES, 2 * ROWS, 32)  # whose rollouts may have another length
     shown = rollout(1, 2 * ROWS)
@@ -154,9 +180,7 @@ def test_a_choice_is_learned_from_rollouts_people_and_demonstrations() -> None:
 
 
 def test_people_teach_also_in_rollouts_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    sampled: list[torch.Tensor] = []
-    gradients = Sac.gradients
-    monkeypatch.setattr(Sac, "gradients", lambda sac, batch: sampled.append(batch.rewards) or gradients(sac, batch))
+    sampled = sampled_rewards(monkeypatch)
     learner = trained(ReplayLearner(spec_of(), SPACES), 1)
     own = rollout(2)
     own.rewards[:] = 77.0

@@ -417,7 +417,7 @@ def test_sac_replaces_the_settings_of_another_algorithm_and_keeps_its_own() -> N
     ("settings", "unread", "read"),
     [
         ({}, "training.passes training.trace_clip policy.memory_units training.n_step", "training.trace_lambda"),
-        ({"training": {"algorithm": "appo"}}, "training.rho_clip training.target_rate", "training.passes"),
+        ({"training": {"algorithm": "appo"}}, "training.rho_clip training.n_step", "training.passes"),
         (
             {"training": {"algorithm": "appo", "exploration": [0.1]}},
             "training.trace_clip training.proximal_policy",
