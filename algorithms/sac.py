@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -96,10 +97,8 @@ class TwinCritics(nn.Module):
         given = [None] * len(self._widths) if moments is None else moments.split(self._widths, -1)
         layers = zip(self.weights, self.biases, self.factors, self.offsets, given, strict=True)
         for number, (weight, bias, factor, offset, known) in enumerate(layers):
-            if known is None:
-                known = _moments(hidden)
-            used.append(known)
-            mean, variance = known.unbind()
+            used.append(_moments(hidden) if known is None else known)
+            mean, variance = used[-1].unbind()
             # The normalisation of the inputs is a change of weight and bias, which are smaller than a batch of inputs.
             with full_precision(hidden):
                 scale = factor * (variance + _EPSILON).rsqrt()[..., None]  # [2, N_k, 1]
@@ -112,14 +111,32 @@ class TwinCritics(nn.Module):
         return hidden, torch.cat(used, -1)
 
 
+class _Moments(torch.autograd.Function):
+    """Mean and variance over B rows [2, 2, N] of values [2, B, N]: its gradient takes two operations on all values."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        """Return the moments."""
+        with full_precision(values):
+            exact = values.float()
+            # A product takes a fourth of the time of a sum over the rows.
+            share = exact.new_full((1, 1, exact.shape[1]), 1.0 / exact.shape[1]).expand(2, -1, -1)
+            mean = share @ exact  # [2, 1, N]
+            variance = share @ (exact - mean).square()
+        ctx.save_for_backward(values, mean)
+        return torch.stack([mean, variance]).squeeze(2)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        """Return the gradient of the values: (g_mean + 2 g_variance (value - mean)) / B."""
+        values, mean = ctx.saved_tensors
+        of_mean, of_variance = (gradients[0][..., None, :] / values.shape[1]).unbind()
+        slope = 2.0 * of_variance
+        return torch.addcmul((of_mean - slope * mean).to(values.dtype), values, slope.to(values.dtype))
+
+
 def _moments(values: Tensor) -> Tensor:
-    """Return mean and variance over B rows [2, 2, N] of values [2, B, N]."""
-    with full_precision(values):
-        values = values.float()
-        # A product takes a fourth of the time of a sum over the rows.
-        share = values.new_full((1, 1, values.shape[1]), 1.0 / values.shape[1]).expand(2, -1, -1)
-        mean = share @ values
-        return torch.stack([mean, share @ (values - mean).square()]).squeeze(2)
+    return _Moments.apply(values)  # pyright: ignore[reportReturnType]
 
 
 def _few_features(inputs: int) -> tuple[nn.Module, int]:
