@@ -86,7 +86,7 @@ class GradientComputer:
         self._recorder = OperationRecorder()
         self._first_pass: FirstPass | None = None  # of the newest batch
         if is_own(spec.algorithm):
-            device = self.parameters.values.device
+            device, attributes = self.parameters.values.device, dict(vars(self.algorithm))
             check_updates(
                 spec,
                 lambda batch: self.compute(batch.to(device), spec.entropy_bonus),
@@ -94,6 +94,7 @@ class GradientComputer:
                 spaces,
                 network.state_size,
             )
+            vars(self.algorithm).update(attributes)  # the run begins with those before the trial
             self._first_pass = None
 
     def compute(self, batch: Batch, entropy_bonus: float | Tensor, then: Then | None = None) -> Iterator[Terms]:
@@ -138,8 +139,17 @@ class GradientComputer:
 
         changed = [self.parameters.gradients, *(() if then is None else then.changed)]
         # The spaces, and the number of rows and environments, decide the shapes of everything else.
-        name = (function, then is None, minibatch.shares.shape)
+        name = (function, then is None, minibatch.shares.shape, *self._kept_by_recording())
         return self._recorder.call(name, update, [*minibatch.tensors(), bonus], changed, tells_shapes=True)
+
+    def _kept_by_recording(self) -> Iterator[object]:
+        """Yield what a recording of an algorithm of the user's own keeps: its numbers, and where its tensors are."""
+        if is_own(self._spec.algorithm):
+            for value in (*vars(self.algorithm).values(), *self.algorithm.statistics.values()):
+                if isinstance(value, Tensor):
+                    yield value.data_ptr()
+                elif isinstance(value, int | float | str):
+                    yield value
 
     def _differentiated(self, losses: Losses, bonus: Tensor, then: Then | None) -> tuple[Tensor, ...]:
         """Write the gradient [P] of the weighted sum of losses. Return their Terms."""

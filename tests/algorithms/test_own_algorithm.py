@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from building import POLICY, RECURRENT, SPACES, identity, make_rollout, make_rollouts, run_spec
+from building import POLICY, RECURRENT, SPACES, identity, join, make_rollout, make_rollouts, run_spec
 
+from daedalus.algorithms.gradients import GradientComputer
+from daedalus.algorithms.recording import EARLIER_CALLS
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.cli.commands.learner import learner_options, parser
 from daedalus.launch.learner_process import choose_run
@@ -16,6 +18,7 @@ from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.program_check import PolicyError
+from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
 from daedalus.protocol.algorithms import AlgorithmError
 from daedalus.protocol.compact import bfloat16, float32
@@ -119,6 +122,20 @@ class Adaptive(A3c):
         self.statistics["weight"].mul_(1.0 / 3.0)
         self.statistics["updates"].add_(1)
         self.statistics["odd"].logical_not_()
+
+class Fading(Appo):
+    record = AlgorithmRecord(passes_over_batch=True)
+
+    def __init__(self, spec, distribution):
+        super().__init__(spec, distribution)
+        self.weight, self.statistics = 100, {"updates": torch.zeros(())}
+
+    def value_loss(self, minibatch, values):
+        return 0.0 * values.sum() + self.weight + self.statistics["updates"]
+
+    def after_update(self, policy_version, forward):
+        self.weight -= 10
+        self.statistics = {"updates": self.statistics["updates"] + 1}
 
 class FaultyAfter(A3c):
     def after_update(self, policy_version, forward):
@@ -228,6 +245,18 @@ def test_what_follows_an_update_is_saved_and_restored(modules: UserModules) -> N
     second.restore(3, {name: values.copy() for name, values in first.weights().items()}, state)
     second.step(make_rollouts(9), 0.0)
     assert float(second.state()["algorithm/updates"]) == 4.0
+
+
+def test_losses_follow_the_attributes_that_change_after_an_update(modules: UserModules) -> None:
+    """Also once the operations of a minibatch are recorded. The trial before the run leaves them as they were."""
+    spec = resolved(modules, "Fading", passes=10, minibatches=3).training
+    computer = GradientComputer(spec, ActorCritic(POLICY, SPACES, training=spec), SPACES, modules)
+    terms = []
+    for version, each in enumerate(computer.compute(join(make_rollouts(0)), 0.0), start=1):
+        terms.append(float(each.value_loss))
+        computer.after_update(version)
+    assert len(terms) > EARLIER_CALLS + 5
+    assert terms == [100 - 9 * update for update in range(len(terms))]
 
 
 def test_actors_that_compute_gradients_have_the_statistics_of_the_learner(modules: UserModules) -> None:
