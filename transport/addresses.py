@@ -64,8 +64,8 @@ def socket_address(path: str) -> str:
 
 
 def is_socket_path(path: str) -> bool:
-    """Return whether a Unix socket can have this path."""
-    return path.startswith("/") and len(os.fsencode(path)) <= _MAX_PATH_BYTES
+    """Return whether a Unix socket can have this path. In an address, `?` and `#` would end it."""
+    return path.startswith("/") and len(os.fsencode(path)) <= _MAX_PATH_BYTES and not {*path} & {*"?#"}
 
 
 def _parts(endpoint: str) -> tuple[str, str]:
@@ -75,7 +75,7 @@ def _parts(endpoint: str) -> tuple[str, str]:
         if not is_socket_path(rest):
             raise AddressError(
                 f"{endpoint!r} is not an address: write {_SOCKET}/PATH with an absolute path of at most "
-                f"{_MAX_PATH_BYTES} bytes"
+                f"{_MAX_PATH_BYTES} bytes, without ? and #"
             )
         return protocol, rest
     host, colon, port = rest.rpartition(":")

@@ -203,7 +203,7 @@ def test_folder_that_others_may_enter_is_refused(tmp_path: Path, spoil: Callable
         check_listening([f"unixsock-stream/{folder}/s"], tls=False, insecure=True)
 
 
-@pytest.mark.parametrize("path", ["relative/s", "", "/" + 98 * "x"])
+@pytest.mark.parametrize("path", ["relative/s", "", "/" + 98 * "x", "/tmp/a?b/s", "/tmp/a#b/s"])
 def test_impossible_path_is_rejected(path: str) -> None:
     with pytest.raises(AddressError, match="absolute path of at most 98 bytes"):
         check_connecting([f"unixsock-stream/{path}"], tls=False)
