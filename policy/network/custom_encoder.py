@@ -7,8 +7,11 @@ components, the class is constructed with a map of shapes, and called with a map
 int64 [N, D].
 """
 
+import logging
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache
 from typing import Any
 
 import torch
@@ -23,6 +26,8 @@ from daedalus.protocol.spec import PolicySpec
 
 _ROWS = 3  # not the number of rows of the recording
 _TOLERANCE = 1e-3
+
+_logger = logging.getLogger(__name__)
 
 
 class PositionalEncoder(nn.Module):
@@ -41,7 +46,7 @@ def check_recording(encoder: PositionalEncoder, example: tuple[Tensor, ...], spa
     """Raise NetworkError if the features of some observations are others in a recording of the call with an example.
 
     Torch records the operations of one call for the program of the actors: Python code that depends on values is not
-    part of it. The network of the learner has its dropout, the program has none: that may differ.
+    part of it. The network of the learner has its dropout, the program has none: that is only warned of.
     """
     training = [(module, module.training) for module in encoder.modules()]
     encoder.eval()  # as it is exported
@@ -62,6 +67,25 @@ def check_recording(encoder: PositionalEncoder, example: tuple[Tensor, ...], spa
             module.training = mode
 
 
+def _varies_in_training(encoder: PositionalEncoder, spaces: ObservationSpaces) -> bool:
+    """Return whether the features of the same observations vary in the learner, as with dropout."""
+    with torch.no_grad(), torch.random.fork_rng(devices=()):
+        for tensors in _observations(spaces):
+            with suppress(Exception):  # the environment has no such values
+                return not _equal(encoder(*tensors), encoder(*tensors))
+    return False
+
+
+@cache  # a policy may have another one for its values
+def _warn_of_dropout(name: str) -> None:
+    _logger.warning(
+        "policy.encoder=%s: its features vary from call to call in the learner, as with dropout, which actors do not "
+        "have: the learner then takes their probabilities for others; set dropout=0.0, also in "
+        "nn.TransformerEncoderLayer, whose default is 0.1",
+        name,
+    )
+
+
 def _compare(encoder: PositionalEncoder, recorded: Callable[..., Tensor], tensors: tuple[Tensor, ...]) -> None:
     features = encoder(*tensors)
     if not _equal(features, encoder(*tensors)):
@@ -74,19 +98,25 @@ def _compare(encoder: PositionalEncoder, recorded: Callable[..., Tensor], tensor
             "returns other features for an observation that is alone in its call: each of the N rows must be computed "
             "by itself (attention needs batch_first=True)"
         )
-    if not _equal(features, _played(recorded, tensors)):
+    played = _played(recorded, tensors)
+    if played is None:
+        raise NetworkError(
+            "its exported program fails for another number of rows: write observations.shape[0] for N, because "
+            "len(observations) is a constant there, as are values that Python code reads (item(), tolist(), NumPy)"
+        )
+    if not _equal(features, played):
         raise NetworkError(
             "returns other features than its exported program: Python code that depends on the values of tensors (if, "
             "for, item(), NumPy) is not exported; use torch operations such as torch.where"
         )
 
 
-def _played(recorded: Callable[..., Tensor], tensors: tuple[Tensor, ...]) -> Tensor:
-    """Return the features of a recording; nothing if it cannot be played with this number of rows."""
+def _played(recorded: Callable[..., Tensor], tensors: tuple[Tensor, ...]) -> Tensor | None:
+    """Return the features of a recording, or None if it cannot be played with this number of rows."""
     try:
         return recorded(*tensors)
     except RuntimeError:
-        return torch.zeros(0)
+        return None
 
 
 def _equal(first: Tensor, second: Tensor) -> bool:
@@ -132,7 +162,10 @@ class CustomEncoder(nn.Module):
             self.module = encoder(shapes if self._only is None else shapes[self._only])
             zeros = _zeros(spaces)
             self.features = _checked_features(self.module, self._inputs(zeros))
-            check_recording(PositionalEncoder(self.module, self.forward, tuple(zeros)), tuple(zeros.values()), spaces)
+            encoder = PositionalEncoder(self.module, self.forward, tuple(zeros))
+            check_recording(encoder, tuple(zeros.values()), spaces)
+            if _varies_in_training(encoder, spaces):
+                _warn_of_dropout(name)
         except UserModuleError as error:
             raise NetworkError(str(error)) from error.__cause__
         except NetworkError as error:
