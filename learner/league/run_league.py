@@ -129,7 +129,7 @@ class League:
         with self._lock:
             if self._changed and time.monotonic() >= self._plan_at:
                 self._make_plan()
-            if self._keeping or (self._kept and env_steps < self._keep_at):
+            if self._keeping or env_steps < self._keep_at:
                 return
             self._keeping, self._keep_at = True, env_steps + self._interval
         version = KeptVersion(learner.policy_version, env_steps)
@@ -260,7 +260,7 @@ class League:
                 if isinstance(error, UnreadableError) or kept == self._kept:  # it may pass, or the version was dropped
                     return None
                 assert self._ratings is not None
-                self._kept = kept
+                self._kept, self._keep_at = kept, self._keep_at if kept else 0
                 self._ratings.retire(player)
                 self._make_plan()
             _logger.warning("version %d of the league plays no more: %s", version, error)

@@ -162,11 +162,17 @@ def test_a_full_disk_keeps_no_version_and_the_run_goes_on(tmp_path: Path, caplog
     (tmp_path / "league").write_text("not a folder")
     run = Run(tmp_path)
     run.plan()
-    run.train(0)
-    assert "version 0 is not kept for the league: " in caplog.text
+    run.train(0, 50, 99)
+    (line,) = caplog.messages
+    assert line.startswith("version 0 is not kept for the league: ")
+    assert line.endswith("the next version is kept after 100 env_steps more")
     (tmp_path / "league").unlink()
     run.train(100)
     assert run.opponents == {"v100"}
+    (tmp_path / "league" / "0000000100" / "parameters.safetensors").unlink()
+    run.snapshot("v100")
+    run.train(110)  # the league has no version any more
+    assert run.opponents == {"v110"}
 
 
 def test_another_run_is_an_opponent_with_a_program_of_its_own_which_stays(tmp_path: Path) -> None:
