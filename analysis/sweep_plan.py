@@ -222,11 +222,11 @@ def _check_same(run: PlannedRun) -> None:
     before, now = (_flat(spec) for spec in (run_directory.read_config(run.directory), run.spec))
     if now[_PACKAGE] is None:  # then the run has the one that was installed when it began
         now[_PACKAGE] = before.get(_PACKAGE)
-    different = [key for key in now if before.get(key) != now[key]]
+    different = [key for key in {**now, **before} if before.get(key) != now.get(key)]  # [lessons] may have no setting
     if different:
         key = different[0]
         raise SettingsError(
-            f"{run.directory} was begun with other settings ({key} is {before.get(key)}, and not {now[key]}): "
+            f"{run.directory} was begun with other settings ({key} is {before.get(key)}, and not {now.get(key)}): "
             "choose another --folder, or remove this one"
         )
 

@@ -189,6 +189,14 @@ def test_a_run_that_was_begun_with_other_settings_is_refused(tmp_path: Path) -> 
     )
 
 
+def test_a_run_that_was_begun_with_a_lesson_is_no_run_without_one(tmp_path: Path) -> None:
+    task = ("--set", "environment.parameters.low=-0.05")
+    (run,) = planner(tmp_path, *task, "--set", "lessons.low.between=[-0.1, 0.0]").runs("", {}, [1])
+    finish(run)
+    with pytest.raises(SettingsError, match=r"other settings \(lessons\.low is \{.*\}, and not None\)"):
+        planner(tmp_path, *task).runs("", {}, [1])
+
+
 def test_a_run_that_has_recorded_the_package_of_its_environment_has_the_same_settings(tmp_path: Path) -> None:
     (run,) = planner(tmp_path).runs("", {}, [1])
     environment = run.spec.environment.model_copy(update={"package": "gymnasium==1.0"})
