@@ -1,13 +1,14 @@
 """Backend `gymnasium`: its environments and those that users register with it. Also backend `fast`, for CarRacing."""
 
 import importlib
+import inspect
 import sys
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import gymnasium
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import CloudpickleWrapper
 from gymnasium.wrappers import TimeLimit
@@ -40,6 +41,7 @@ _ATARI_GAME_KWARGS = (
     *("repeat_action_probability", "full_action_space", "mode", "difficulty"),
     *("noop_max", "use_fire_reset"),
 )
+_LIMIT = "max_episode_steps"
 _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
@@ -58,6 +60,9 @@ class EnvironmentFactory:
         """Return a new environment. Raises whatever the environment raises."""
         spec, registered = self.spec, self.registered or registration(self.spec.id, self.modules)
         kwargs = _kwargs(spec)
+        if _LIMIT in spec.constructor_kwargs and _takes_limit(registered):
+            registered = replace(registered, kwargs={**registered.kwargs, _LIMIT: spec.constructor_kwargs[_LIMIT]})
+            kwargs[_LIMIT] = spec.max_episode_steps
         of_atari = atari.take_arguments(kwargs) if registered.namespace == "ALE" else {}
         if self.render_mode is not None:
             kwargs["render_mode"] = self.render_mode
@@ -291,8 +296,16 @@ def _in_processes(factory: EnvironmentFactory, count: int) -> EnvironmentProcess
 
 
 def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:
-    limit = {} if spec.max_episode_steps is None else {"max_episode_steps": spec.max_episode_steps}
+    limit = {} if spec.max_episode_steps is None else {_LIMIT: spec.max_episode_steps}
     return {**spec.constructor_kwargs, **limit}
+
+
+def _takes_limit(registered: EnvSpec) -> bool:
+    """Return whether the constructor has an argument max_episode_steps, which gymnasium.make keeps for itself."""
+    entry = registered.entry_point
+    with suppress(TypeError, ValueError):  # of a constructor in C
+        return _LIMIT in inspect.signature(load_env_creator(entry) if isinstance(entry, str) else entry).parameters  # pyright: ignore[reportArgumentType]
+    return False
 
 
 def _check_limit(environment: gymnasium.Env, spec: EnvironmentSpec) -> None:

@@ -218,7 +218,7 @@ def _checked_features(module: nn.Module, zeros: Tensor | dict[str, Tensor]) -> i
     if buffers:
         raise NetworkError(
             f"its buffer {buffers[0]!r} would not reach the actors, which receive only parameters: avoid buffers "
-            "(use LayerNorm instead of BatchNorm)"
+            "(use LayerNorm instead of BatchNorm, and nn.Parameter with requires_grad=False for constants)"
         )
     with torch.no_grad():
         features = module(zeros)

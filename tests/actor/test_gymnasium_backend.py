@@ -11,7 +11,7 @@ from ctypes.util import find_library
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -130,6 +130,20 @@ def test_a_limit_beyond_that_of_the_environment_itself_is_refused(
     text = "environment.max_episode_steps=201 has no effect.*truncates its episodes after 200 steps itself"
     with pytest.raises(EnvironmentSetupError, match=text) if refused else nullcontext():
         make_environments(EnvironmentSpec(id="Made-v0", max_episode_steps=limit), 1).close()
+
+
+def test_an_argument_of_the_constructor_may_have_the_name_of_the_episode_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """gymnasium.make keeps max_episode_steps for its own limit: the constructor would have its default."""
+
+    def made(max_episode_steps: int = 2) -> gymnasium.Env:
+        return EnvironmentFactory(spec=_counting(kwargs={"ends": [max_episode_steps]}), modules=TEST_MODULES)()
+
+    monkeypatch.setitem(gymnasium.registry, "Made-v0", EnvSpec("Made-v0", cast(Any, made)))
+    for limit, ends in ((None, 4), (3, 3)):
+        spec = EnvironmentSpec(id="Made-v0", kwargs={"max_episode_steps": 4}, max_episode_steps=limit)
+        environments = make_environments(spec, 1)
+        environments.reset(1)
+        assert [row[2] or row[3] for row in _rows(environments, [0] * ends)] == [False] * (ends - 1) + [True]
 
 
 def test_no_reward_limit_ends_episodes_after_steps_without_a_positive_reward() -> None:
