@@ -9,7 +9,13 @@ from torch import Tensor
 from daedalus.algorithms.algorithm import Algorithm, Forward, Losses, MinibatchLosses
 from daedalus.algorithms.batch import Batch, Pass
 from daedalus.algorithms.diagnostics import FirstPass
-from daedalus.algorithms.losses import policy_factors, policy_gradient_loss, shares_of, surrogate_policy_loss
+from daedalus.algorithms.losses import (
+    policy_factors,
+    policy_gradient_loss,
+    shares_of,
+    surrogate_policy_loss,
+    value_loss,
+)
 from daedalus.algorithms.minibatches import Minibatch, draw_pass, minibatches
 from daedalus.algorithms.returns import Targets, lambda_targets, vtrace_corrected_targets
 from daedalus.protocol.algorithms import ALGORITHMS
@@ -131,13 +137,13 @@ class Appo(Algorithm):
             value_loss=self.value_loss(minibatch, values),
         )
 
-    def value_loss(self, minibatch: Minibatch, values: Tensor) -> Tensor | None:
-        """Return the value loss of a minibatch, a scalar; None: the one that `training.value_loss` names.
+    def value_loss(self, minibatch: Minibatch, values: Tensor) -> Tensor:
+        """Return the value loss of a minibatch, a scalar: the one that `training.value_loss` names.
 
-        For subclasses.
+        For subclasses, which may replace it or add to it.
 
         Args:
           minibatch: has the values of the network before the first pass, and the value targets, [R, B].
           values: [R, B], those of the network now.
         """
-        return None
+        return value_loss(values, minibatch.targets, minibatch.shares, self.spec.value_loss)
