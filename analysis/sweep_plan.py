@@ -28,6 +28,11 @@ class Choices:
     key: str
     values: tuple[str, ...]
 
+    @property
+    def first(self) -> str:
+        """The first value."""
+        return self.values[0]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Range:
@@ -37,6 +42,11 @@ class Range:
     low: float
     high: float
     whole: bool  # whether its values are integers
+
+    @property
+    def first(self) -> str:
+        """The lowest value."""
+        return self.written(self.low)
 
     @property
     def log(self) -> bool:

@@ -6,7 +6,9 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import tomli_w
 
@@ -18,6 +20,7 @@ from daedalus.cli.settings_arguments import add_log, add_settings, run_choice
 from daedalus.launch.environment_check import EnvironmentProblemError, checked_defaults, checked_spaces
 from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.launch.process_lifecycle import stop_on_signals
+from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
@@ -92,7 +95,7 @@ def sweep(arguments: list[str]) -> int:
         folder = parsed.folder or _default_folder(parsed, axes)
         if parsed.sampler:
             import_optuna()  # before the check, which takes seconds
-        planner, seeds = _planner(parsed, folder)
+        planner, seeds = _planner(parsed, axes, folder)
         search: Search | None = None
         if not parsed.sampler:  # before the folder is made: the settings may be invalid
             search = GridSearch(planner, [axis for axis in axes if isinstance(axis, Choices)], seeds)
@@ -150,18 +153,31 @@ def _default_folder(parsed: argparse.Namespace, axes: Sequence[Axis]) -> Path:
     return Path("sweeps") / "-".join(re.sub(r"[^\w.]+", "-", word).strip("-.") for word in words if word)
 
 
-def _planner(parsed: argparse.Namespace, folder: Path) -> tuple[Planner, range]:
+def _planner(parsed: argparse.Namespace, axes: Sequence[Axis], folder: Path) -> tuple[Planner, range]:
     """Check the environment, and return the planner of the runs, and their seeds.
 
     Raises SettingsError, EnvironmentProblemError.
     """
-    choice, defaults = run_choice(parsed), None
+    choice = run_choice(parsed)
+    try:
+        defaults, first = _checked(choice)
+    except (SettingsError, EnvironmentProblemError):
+        if not axes:
+            raise
+        # The environment, or another setting, may need one that the sweep varies.
+        varied = (f"{axis.key}={axis.first}" for axis in axes)
+        defaults, first = _checked(replace(choice, assignments=(*choice.assignments, *varied)))
+    return Planner(choice, parsed.log, folder, defaults), range(first, first + parsed.seeds)
+
+
+def _checked(choice: RunChoice) -> tuple[dict[str, Any] | None, int]:
+    """Check the environment, and return the settings that it begins with, if it has no preset, and the seed."""
+    defaults = None
     if choice.env is None:
         checked_spaces(choice.spec(), fork=True)
     else:
         _, defaults = checked_defaults(choice.spec, fork=True)
-    first = choice.spec(defaults).training.seed
-    return Planner(choice, parsed.log, folder, defaults), range(first, first + parsed.seeds)
+    return defaults, choice.spec(defaults).training.seed
 
 
 def _locked(folder: Path) -> RunLock:

@@ -75,3 +75,12 @@ def test_the_folder_and_the_seeds_follow_from_the_command(monkeypatch: pytest.Mo
     assert "collection.rollout_length=5,20" in (folder / "sweep.toml").read_text()
     assert [run.seed for run in search.planned] == [10, 10, 11, 11, 12, 12]
     assert {run.spec.training.algorithm for run in search.planned} == {"a2c"}
+
+
+def test_what_the_sweep_varies_may_be_what_another_setting_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or the environment: an argument of its constructor without a default."""
+    seen = []
+    monkeypatch.setattr(command, "_run", lambda search, *_: seen.extend(search.planned) or 0)
+    lesson = ("--set", "environment.parameters.low=-0.05", "--set", "lessons.low.steps=[-0.01]")
+    assert sweep(["cartpole", *lesson, "--over", "lessons.low.above=100,200", "--seeds", "1"]) == 0
+    assert [run.spec.lessons["low"].above for run in seen] == [100, 200]
