@@ -636,10 +636,10 @@ class Learner:
             if saved is not None and name.endswith(("/count", "/nonzero")) and not saved.shape:
                 saved = saved.expand(statistic.shape)  # in checkpoints of earlier releases: one count for all numbers
             if saved is None or saved.shape != statistic.shape:
-                raise CheckpointMismatchError(
-                    f"the checkpoint lacks the statistics {name!r}: restore training.optimizer, "
-                    "training.normalize_rewards and policy.normalize_observations of the run"
-                )
+                remedy = "training.optimizer, training.normalize_rewards and policy.normalize_observations of the run"
+                if name.startswith("algorithm/") and is_own(self._spec.algorithm):
+                    remedy = f"the class {self._spec.algorithm} that the run was trained with"
+                raise CheckpointMismatchError(f"the checkpoint lacks the statistics {name!r}: restore {remedy}")
             statistic.copy_(saved)
         torch.set_rng_state(state["torch_random_state"])
         self.policy_version = version

@@ -15,6 +15,7 @@ from daedalus.cli.commands.learner import learner_options, parser
 from daedalus.launch.learner_process import choose_run
 from daedalus.launch.run_choice import with_record
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.program_check import PolicyError
@@ -248,6 +249,9 @@ def test_what_follows_an_update_is_saved_and_restored(modules: UserModules) -> N
     second.restore(3, {name: values.copy() for name, values in first.weights().items()}, state)
     second.step(make_rollouts(9), 0.0)
     assert float(second.state()["algorithm/updates"]) == 4.0
+    del state["algorithm/updates"]  # the class has got them since
+    with pytest.raises(CheckpointMismatchError, match="'algorithm/updates': restore the class own_algorithms:Counting"):
+        second.restore(3, first.weights(), state)
 
 
 def test_losses_follow_the_attributes_that_change_after_an_update(modules: UserModules) -> None:
