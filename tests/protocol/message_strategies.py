@@ -121,7 +121,7 @@ run_specs = st.builds(
     service=st.builds(ServiceSpec, log_seconds=st.floats(0.01, 100)),
 )
 for of_kind, strategy in ((str, text), (int, counters), (float, floats)):
-    st.register_type_strategy(of_kind, strategy)
+    st.register_type_strategy(of_kind, lambda _kind, strategy=strategy: strategy)
 
 
 def inferred(kind: type, **chosen: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
