@@ -126,25 +126,40 @@ def test_no_decision_depends_on_the_system_clock() -> None:
     assert users <= DATING
 
 
-@pytest.mark.parametrize(
-    ("module", "absent"),
-    [
-        ("cli.main", {"numpy", "pydantic"}),  # the command may be a process of its own
-        ("cli.commands.actor", {"torch", "daedalus.learner", "daedalus.algorithms"}),
-        ("cli.commands.evaluate", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
-        ("cli.commands.learner", {"torch", "daedalus.actor", "gymnasium"}),
-        ("cli.commands.train", {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime"}),
-        ("launch.train_function", {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime", "shtab"}),
-        ("launch.evaluation", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
-        ("actor.evaluation.loaded_policy", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
-        ("cli.commands.router", {"torch", "daedalus.actor", "gymnasium", "onnxruntime"}),
-        ("cli.commands.exporter", {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"}),
-        ("protocol.codec", {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),
-        ("gateway.server", {"torch", "daedalus.learner", "daedalus.algorithms"}),
-        ("gateway.client_gateway", {"torch", "daedalus.learner", "daedalus.algorithms"}),
+# What a process has not loaded after the modules that it needs, in two processes: one that imports a row has imported
+# the rows above it, too, whose processes load none of what is absent in it.
+NEEDED = {
+    "with the learner": [
+        (["cli.main"], {"numpy", "pydantic"}),  # the command may be a process of its own
+        (
+            ["cli.commands.train", "launch.train_function"],
+            {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime", "shtab", "prometheus_client"},
+        ),
+        (
+            ["cli.commands.router", "cli.commands.exporter"],
+            {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"},
+        ),
+        (["cli.commands.learner"], {"torch", "daedalus.actor", "gymnasium"}),
     ],
-)
-def test_a_process_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
-    program = f"import sys, daedalus.{module}; print('\\n'.join(sys.modules))"
+    "with the actor": [
+        (["protocol.codec"], {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),
+        (
+            ["actor.evaluation.loaded_policy", "launch.evaluation", "cli.commands.evaluate"],
+            {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"},
+        ),
+        (
+            ["gateway.client_gateway", "gateway.server", "cli.commands.actor"],
+            {"torch", "daedalus.learner", "daedalus.algorithms"},
+        ),
+    ],
+}
+
+
+@pytest.mark.parametrize("rows", NEEDED.values(), ids=NEEDED)
+def test_a_process_loads_only_what_it_needs(rows: list[tuple[list[str], set[str]]]) -> None:
+    program = "import sys\n" + "".join(
+        f"import {', '.join(f'daedalus.{module}' for module in modules)}; print(*sys.modules)\n" for modules, _ in rows
+    )
     output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert not absent & set(output.splitlines())
+    for (modules, absent), loaded in zip(rows, output.splitlines(), strict=True):
+        assert not absent & set(loaded.split()), modules
