@@ -33,7 +33,7 @@ settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Ph
 settings.load_profile("daedalus")
 
 # Names in a module of tests that starts processes.
-STARTING = {"subprocess", "Running", "starting", "processes_mentioning", "installed", "nbclient"}
+STARTING = {"subprocess", "Running", "starting", "processes_mentioning", "installed", "nbformat"}
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -6,15 +6,15 @@ import gymnasium
 import numpy as np
 import pytest
 
-pytest.importorskip("minigrid")
-
-from minigrid.core.grid import Grid
-from minigrid.envs.doorkey import DoorKeyEnv
-from minigrid.minigrid_env import MiniGridEnv
-
 from daedalus.actor.environments.minigrid_views import speed_up
 
 STEPS = 100
+
+
+@pytest.fixture(autouse=True)
+def _minigrid() -> None:
+    """Import MiniGrid, which takes a sixth of a second, in the worker of these tests alone."""
+    pytest.importorskip("minigrid")
 
 
 def assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
@@ -63,6 +63,10 @@ def test_observations_are_those_of_minigrid(name: str, kwargs: dict[str, Any]) -
 
 
 def test_what_is_not_minigrids_own_is_left_as_it_is() -> None:
+    from minigrid.core.grid import Grid
+    from minigrid.envs.doorkey import DoorKeyEnv
+    from minigrid.minigrid_env import MiniGridEnv
+
     class OwnView(DoorKeyEnv):
         def gen_obs(self) -> dict[str, Any]:
             return {**super().gen_obs(), "image": np.zeros((7, 7, 3), np.uint8)}

@@ -10,14 +10,17 @@ from processes import LIMIT
 import daedalus
 
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "first_steps.ipynb"
-nbformat = pytest.importorskip("nbformat")
-nbclient = pytest.importorskip("nbclient")
-pytest.importorskip("ipykernel")
-pytest.importorskip("av")
-pytest.importorskip("matplotlib")
 
 
-def test_the_notebook_is_stored_without_outputs_and_uses_the_public_api_only() -> None:
+@pytest.fixture
+def nbformat() -> Any:
+    """Import what the notebook needs, which takes a fifth of a second, in the worker of these tests alone."""
+    for name in ("nbclient", "ipykernel", "av", "matplotlib"):
+        pytest.importorskip(name)
+    return pytest.importorskip("nbformat")
+
+
+def test_the_notebook_is_stored_without_outputs_and_uses_the_public_api_only(nbformat: Any) -> None:
     notebook = nbformat.read(NOTEBOOK, 4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -30,8 +33,10 @@ def test_the_notebook_is_stored_without_outputs_and_uses_the_public_api_only() -
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_the_notebook_trains_plots_evaluates_shows_a_video_and_acts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nbformat: Any
 ) -> None:
+    from nbclient import NotebookClient
+
     monkeypatch.delenv("MPLBACKEND", raising=False)  # another test of this process may have set it
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path / "jupyter"))
@@ -39,7 +44,7 @@ def test_the_notebook_trains_plots_evaluates_shows_a_video_and_acts(
     (training,) = (cell for cell in notebook.cells if cell.id == "train")
     assert "env_steps=600_000" in training.source
     training.source = training.source.replace("600_000", "30_000")  # a reader has the time to learn it
-    client = nbclient.NotebookClient(notebook, timeout=int(5 * LIMIT), resources={"metadata": {"path": str(tmp_path)}})
+    client = NotebookClient(notebook, timeout=int(5 * LIMIT), resources={"metadata": {"path": str(tmp_path)}})
     client.execute()
     cells = {cell.id: cell for cell in notebook.cells}
     (run,) = (tmp_path / "runs").iterdir()
