@@ -5,6 +5,7 @@ import json
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,17 @@ import pytest
 import safetensors.numpy
 from counting_environment import Counting
 from PIL import Image
-from processes import Running, processes_mentioning
+from processes import LIMIT, Running, processes_mentioning
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.evaluation.evaluator import Evaluator
+from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.analysis.recorded_run import read_record
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.commands.train import report as report_of
 from daedalus.launch.child_output import ChildOutput
+from daedalus.launch.final_evaluation import FinalEpisodes
 from daedalus.launch.local_run import LocalRun, RunStoppedError
 from daedalus.launch.local_training import evaluate_run
 from daedalus.learner.run.run_directory import create, read_json, write_config, write_json
@@ -31,6 +35,7 @@ from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.texts import short_number
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 Start = Callable[..., Running]
 
@@ -324,7 +329,7 @@ def test_a_shipped_policy_gets_the_returns_of_its_run(
 
 
 def test_the_pretrained_car_racing_policy_drives(evaluate: Callable[..., dict]) -> None:
-    result = evaluate("--pretrained", "car_racing", "--backend", "fast", "--episodes", 4)
+    result = evaluate("--pretrained", "car_racing", "--backend", "fast", "--episodes", 2)
     assert result["return_mean"] > 600  # 905 over 100 episodes; a car that stands still has -100
 
 
@@ -394,15 +399,29 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
     assert [best_score(each) for each in best_checkpoints(run)] == [each for _, each in scores]
 
 
-def test_new_sampled_episodes_that_confirmed_the_target_are_reported(tmp_path: Path, output: ChildOutput) -> None:
+def evaluated_here(run: LocalRun) -> dict[str, Any]:
+    """Evaluate a run that has been trained, as `evaluate_run` does with processes, and return the summary."""
+    network, stop = MemoryNetwork(), threading.Event()
+    evaluator = Evaluator(ActorConfig(name="evaluation-0", incarnation=1), MemoryTransport(network), stop)
+    thread = threading.Thread(target=evaluator.run, daemon=True)
+    thread.start()
+    with closing(MemoryTransport(network)) as transport:
+        try:
+            FinalEpisodes(run.directory, run.spec, transport, stop).evaluate()
+        finally:
+            stop.set()
+            thread.join(LIMIT)
+    return read_json(run.directory / "summary.json")
+
+
+def test_new_sampled_episodes_that_confirmed_the_target_are_reported(tmp_path: Path) -> None:
     run = save(tmp_path / "run", CARTPOLE, 5, evaluation={"final_episodes": 10})
     played = {"return_mean": 21.5, "return_std": 4.0, "episodes": 40}
     solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 1000.5}
     write_json(run / "summary.json", {**solved, "confirmation": confirmation(played, 20.0)})
     spec = read_policy(run / "checkpoints" / "0000000005").spec
-    write_config(run, spec)
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
-    summary = evaluate_run(local_run, threading.Event(), output)
+    summary = evaluated_here(local_run)
     report = report_of(local_run, summary)
     assert "confirmation: return 21.5 over 40 new sampled episodes" in report
     assert report.splitlines()[1].endswith("95 % interval 20.2 to 22.8; training mean 1000.5")
@@ -413,17 +432,16 @@ def test_new_sampled_episodes_that_confirmed_the_target_are_reported(tmp_path: P
     ("training_mean", "limit", "plays_again"), [(1000.0, None, True), (1.0, None, False), (1000.0, 400, False)]
 )
 def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_sampled_actions(
-    tmp_path: Path, output: ChildOutput, training_mean: float, limit: int | None, plays_again: bool
+    tmp_path: Path, training_mean: float, limit: int | None, plays_again: bool
 ) -> None:
     """Not where training played another task, as with no_reward_limit: its returns say nothing then."""
     environment = CARTPOLE.model_copy(update={"no_reward_limit": limit})
     run = save(tmp_path / "run", environment, 5, evaluation={"final_episodes": 10})
     spec = read_policy(run / "checkpoints" / "0000000005").spec
-    write_config(run, spec)
     trained = {"solved": False, "env_steps": 9, "updates": 5, "episode_return_mean": training_mean}
     write_json(run / "summary.json", trained)
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
-    summary = evaluate_run(local_run, threading.Event(), output)
+    summary = evaluated_here(local_run)
     assert summary["evaluation"]["actions"] == "greedy"
     assert summary["evaluation_return_mean"] == summary["evaluation"]["return_mean"]
     assert ("sampled_evaluation" in summary) == plays_again
