@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from processes import here
 
 from daedalus.cli.command_table import COMMANDS
 from daedalus.cli.commands.completion import command_tree, completion
@@ -19,12 +20,9 @@ needs_bash = pytest.mark.skipif(BASH is None, reason="bash is not installed")
 
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    program = "from daedalus.cli.main import main; raise SystemExit(main())"
-    output = subprocess.run(
-        [sys.executable, "-c", program, "completion", "bash"], capture_output=True, text=True, check=True
-    ).stdout
+    """The script that the command prints; as a process it is in test_unread_output.py."""
     path = tmp_path_factory.mktemp("completion") / "daedalus"
-    path.write_text(output)
+    path.write_text("\n".join(here("completion", "bash").lines) + "\n")
     return path
 
 

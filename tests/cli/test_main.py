@@ -21,11 +21,15 @@ def test_version_is_that_of_the_package(monkeypatch: pytest.MonkeyPatch, capsys:
 
 def test_python_m_daedalus_is_daedalus_also_beside_a_file_that_is_named_like_a_module(tmp_path: Path) -> None:
     (tmp_path / "signal.py").write_text("raise SystemExit('imported')")
-    for words, status in ((["--version"], 0), (["trian"], 2), (["actor", "--help"], 0)):
+    for words, status, printed in (
+        (["--version"], 0, "daedalus "),
+        (["trian"], 2, "daedalus: unknown command 'trian': did you mean train?\n"),
+        (["actor", "--help"], 0, "usage: daedalus actor "),
+    ):
         line = [sys.executable, "-m", "daedalus", *words]
         ended = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert ended.returncode == status, ended
-        assert "daedalus" in ended.stdout + ended.stderr
+        assert (ended.stdout + ended.stderr).startswith(printed)
 
 
 @pytest.mark.parametrize("parser", [actor.parser, orders.drain_parser])
