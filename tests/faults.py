@@ -1,17 +1,20 @@
-"""Faults for tests: connections that stall or are slow, and a sender of arbitrary rollouts."""
+"""Faults for tests: connections that stall or are slow, a sender of arbitrary rollouts, and processes that crash."""
 
 import contextlib
 import queue
 import secrets
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from plain import ACTION, NAME, vector_spaces
+from processes import Running
 
 from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.actor.session.conversation import Conversation
@@ -210,3 +213,30 @@ class Sender:
     def close(self) -> None:
         """Close the connection."""
         self.transport.close()
+
+
+class Faulty:
+    """A command in which one function raises."""
+
+    def __init__(self, directory: Path, command: str, fault: str, *arguments: object) -> None:
+        module, _, target = fault.partition(":")
+        program = "\n".join(
+            [
+                "import importlib, runpy, sys",
+                f"module = importlib.import_module({module!r})",
+                "def fail(*arguments, **options): raise RuntimeError('a fault of ours')",
+                f"module.{target} = fail",
+                f"sys.argv = [{command!r}, *{[str(argument) for argument in arguments]!r}]",
+                f"runpy.run_module('daedalus.cli.commands.{command}', run_name='__main__', alter_sys=True)",
+            ]
+        )
+        self._running = Running([sys.executable, "-P", "-c", program], directory)
+
+    def assert_crashes(self) -> None:
+        """Its process ends with status 1 and a traceback."""
+        try:
+            assert self._running.wait() == 1
+            assert "Traceback" in self._running.output
+            assert "RuntimeError: a fault of ours" in self._running.output
+        finally:
+            self._running.end()

@@ -1,4 +1,7 @@
-"""An exception in any thread of a service ends its process: traceback, status 1, so that a supervisor restarts it."""
+"""An exception in any thread of a service ends its process: traceback, status 1, so that a supervisor restarts it.
+
+That of an actor is tested in test_refusals.py, where there is a learner for it.
+"""
 
 import subprocess
 import sys
@@ -6,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from faults import Faulty
 from processes import LIMIT, Running
 
 Start = Callable[..., Running]
@@ -15,36 +19,6 @@ LEARNER_FAULTS = {
     "intake": "daedalus.learner.serving.rollout_judge:RolloutJudge.read",
     "a Zenoh thread that reports presence": "daedalus.learner.serving.fleet:Fleet.set_present",
 }
-
-# Of a Zenoh thread that brings an answer.
-ACTOR_FAULT = "daedalus.actor.session.uploading:InFlightRollouts.acknowledge"
-
-
-class Faulty:
-    """A command in which one function raises."""
-
-    def __init__(self, directory: Path, command: str, fault: str, *arguments: object) -> None:
-        module, _, target = fault.partition(":")
-        program = "\n".join(
-            [
-                "import importlib, runpy, sys",
-                f"module = importlib.import_module({module!r})",
-                "def fail(*arguments, **options): raise RuntimeError('a fault of ours')",
-                f"module.{target} = fail",
-                f"sys.argv = [{command!r}, *{[str(argument) for argument in arguments]!r}]",
-                f"runpy.run_module('daedalus.cli.commands.{command}', run_name='__main__', alter_sys=True)",
-            ]
-        )
-        self._running = Running([sys.executable, "-P", "-c", program], directory)
-
-    def assert_crashes(self) -> None:
-        """Its process ends with status 1 and a traceback."""
-        try:
-            assert self._running.wait() == 1
-            assert "Traceback" in self._running.output
-            assert "RuntimeError: a fault of ours" in self._running.output
-        finally:
-            self._running.end()
 
 
 @pytest.mark.parametrize("thread", LEARNER_FAULTS)
@@ -58,13 +32,6 @@ def test_an_exception_in_a_thread_of_the_learner_ends_it(
     actor = start("actor", "--connect", address)
     learner.assert_crashes()
     assert actor.process.poll() is None  # it looks for the learner that a supervisor would restart
-
-
-def test_an_exception_in_a_thread_of_an_actor_ends_it(start: Start, address: str, tmp_path: Path) -> None:
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**12)
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
-    Faulty(tmp_path, "actor", ACTOR_FAULT, "--connect", address).assert_crashes()
-    assert learner.process.poll() is None
 
 
 def test_a_command_of_one_process_has_the_hook_too(tmp_path: Path) -> None:

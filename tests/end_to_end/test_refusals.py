@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from faults import Faulty
 from plain import vector_spaces
 from processes import ENDLESS, LIMIT, PLAYING_SLOW, SLOW, Running, free_address, here, starting, until
 
@@ -86,6 +87,13 @@ def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(s
     third.expect("waiting for the other actor of this name to leave")
     first.end()
     third.expect("joined run 'run' as 'arm'")
+
+
+def test_an_exception_in_a_zenoh_thread_of_an_actor_ends_it_and_not_its_learner(served: str) -> None:
+    """That thread brings an answer. Further threads, also of learners: test_crashes.py."""
+    fault = "daedalus.actor.session.uploading:InFlightRollouts.acknowledge"
+    tests = Path(__file__).parent.parent  # with slow_environment
+    Faulty(tests, "actor", fault, "--connect", served, *PLAYING_SLOW).assert_crashes()
 
 
 def test_a_second_learner_of_the_same_run_is_refused(start: Start, served: str) -> None:
