@@ -346,11 +346,14 @@ def test_certificate_of_another_ca_is_rejected(address: str, strange: Path) -> N
         connect([address.replace("tls/", "tcp/")])
 
 
-def test_foreign_certificate_with_our_ca_file_is_rejected(address: str, certificates: Path, strange: Path) -> None:
+def test_foreign_certificate_with_our_ca_file_is_rejected(
+    address: str, certificates: Path, strange: Path, tmp_path: Path
+) -> None:
     """The client trusts our CA, but its certificate is signed by another one."""
-    (strange / "actor-box" / "ca.pem").write_bytes((certificates / "actor-box" / "ca.pem").read_bytes())
+    folder = shutil.copytree(strange / "actor-box", tmp_path / "actor-box")
+    shutil.copyfile(certificates / "actor-box" / "ca.pem", folder / "ca.pem")
     with pytest.raises(RefusedError, match=r"refuses the certificate in .*revoked, or issued after the service's copy"):
-        connect([address], load(strange / "actor-box", "actor"))
+        connect([address], load(folder, "actor"))
 
 
 def test_expired_certificate_is_rejected_when_loaded(certificates: Path) -> None:
@@ -395,11 +398,11 @@ def test_a_clock_that_is_wrong_is_named_at_both_ends(tmp_path: Path, monkeypatch
         connect([address], unchecked(actor))
 
 
-def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path) -> None:
+def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path, tmp_path: Path) -> None:
     """The learner refuses to start with it, and an actor refuses to connect to it."""
     with pytest.raises(CredentialsError, match="holds the certificate of actor 'arm', but learner is required"):
         load(certificates / "actor-arm", "learner")
-    folder = certificates / "actor-arm"
+    folder = shutil.copytree(certificates / "actor-arm", tmp_path / "actor-arm")
     shutil.copyfile(certificates / "router" / "clients.pem", folder / "clients.pem")
     address, router = listen_somewhere(folder)
     with closing(router), pytest.raises(RefusedError, match="cannot be verified"):
