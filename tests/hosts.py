@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from processes import DAEDALUS, Running
+from processes import Running, command_line
 
 _SWITCH = "switch"
 
@@ -28,7 +28,7 @@ class Host:
 
     def start(self, *arguments: object) -> Running:
         """Start `daedalus ARGUMENTS` on this host."""
-        return self.run(*DAEDALUS, *arguments)
+        return self.run(*command_line(*arguments))
 
     def run(self, *command: object) -> Running:
         """Start a command on this host."""

@@ -110,6 +110,19 @@ def here(command: str, *arguments: object) -> Ended:
     return Ended(status, output.getvalue().splitlines())
 
 
+def command_line(*arguments: object, report: bool = True) -> list[str]:
+    """Return the words that start `daedalus ARGUMENTS`.
+
+    Where `daedalus` replaces itself by the process of the command, these are the words of that process: two
+    interpreters would start otherwise. test_main.py tests the replacement.
+    """
+    command, *rest = map(str, arguments)
+    if command in COMMANDS and not COMMANDS[command].function:
+        return [sys.executable, "-P", "-m", f"daedalus.cli.commands.{command}", *rest]
+    first = DAEDALUS if report or command not in ("train", "resume") else NO_REPORT
+    return [*first, command, *rest]
+
+
 @contextmanager
 def starting(folder: Path) -> Iterator[Callable[..., Running]]:
     """Give a function that starts `daedalus ARGUMENTS` in the folder. Processes left are killed at the end."""
@@ -119,9 +132,8 @@ def starting(folder: Path) -> Iterator[Callable[..., Running]]:
     def start(
         *arguments: object, directory: Path = folder, command: list[str] | None = None, report: bool = False
     ) -> Running:
-        if command is None:
-            command = NO_REPORT if arguments[0] in ("train", "resume") and not report else DAEDALUS
-        running.append(Running(command + [str(argument) for argument in arguments], directory))
+        words = command_line(*arguments, report=report) if command is None else [*command, *map(str, arguments)]
+        running.append(Running(words, directory))
         return running[-1]
 
     try:
@@ -150,7 +162,7 @@ def until(condition: Callable[[], object]) -> None:
     deadline = time.monotonic() + LIMIT
     while not condition():
         assert time.monotonic() < deadline, f"the condition did not hold within {LIMIT:g} s"
-        time.sleep(0.05)
+        time.sleep(0.1)
 
 
 def processes_mentioning(text: str) -> list[int]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from hosts import Network, network_in
-from processes import DAEDALUS, Running, starting
+from processes import Running, command_line, starting
 
 from daedalus.learner.reporting.metrics_rows import read_rows
 
@@ -37,15 +37,16 @@ def test_actors_on_two_hosts_learn_a_task_by_lessons_and_a_host_that_refuses_the
     learner.expect("actors join with")
 
     words = ("actor", "--connect", address, "--name", "refusing", *ALLOWED)
-    refused = refusing.run("env", "-C", narrow, *DAEDALUS, *words)
+    refused = refusing.run("env", "-C", narrow, *command_line(*words))
     assert refused.wait() == 1
     reason = "reset with the options stones=30 raises AssertionError: at most 9 stones fit here"
     assert reason in refused.lines[-1]
-    central.start("status", "--connect", address).expect("refused: refusing .*, 1 x, ")
 
     actors = [host.start("actor", "--connect", address, "--name", host.name, *ALLOWED) for host in hosts]
     learner.expect("lesson stones: 2 ")
-    central.start("status", "--connect", address).expect("lesson stones: ")
+    status = central.start("status", "--connect", address)
+    status.expect("lesson stones: ")
+    status.expect("refused: refusing .*, 1 x, ")
     assert learner.wait() == 0, learner.output
     for actor in actors:
         assert actor.wait() == 0, actor.output
