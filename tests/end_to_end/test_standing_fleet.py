@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, until
+from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, here, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -38,10 +38,9 @@ def test_an_actor_that_stays_serves_the_next_run_until_it_is_drained(
     operator = connect([address])
     until(lambda: "idle" in waiting_actors(operator))
     operator.close()
-    status = start("status", "--connect", address)
-    status.expect("1 actor waits for a run: idle")
-    unknown = start("drain", "standing", "other", "--connect", address)
-    assert unknown.wait() == 1
+    here("status", "--connect", address).expect("1 actor waits for a run: idle")
+    unknown = here("drain", "standing", "other", "--connect", address)
+    assert unknown.status == 1
     unknown.expect("daedalus drain: no actor 'other' takes part or waits for a run")
     drained = start("drain", "standing", "idle", "--connect", address)
     assert drained.wait() == 0, drained.output
@@ -51,8 +50,8 @@ def test_an_actor_that_stays_serves_the_next_run_until_it_is_drained(
     assert actor.wait() == 0, actor.output
     actor.expect(f"drained by {author}: this actor leaves the run")
     second.expect(f"actor=standing: drained by {author}: it leaves after its current rollout")
-    saved = start("checkpoint", "second", "--connect", address)
-    assert saved.wait() == 0, saved.output
+    saved = here("checkpoint", "second", "--connect", address)
+    assert saved.status == 0, saved
     saved.expect("run 'second': checkpoint saved at .* env_steps")
     stopped = start("stop", "second", "--connect", address)
     assert stopped.wait() == 0, stopped.output
@@ -87,9 +86,7 @@ def test_of_two_learners_of_one_run_the_one_continued_from_a_copy_keeps_the_acto
     older.expect("stopped; checkpoint saved at")
     for actor in actors:
         assert actor.process.poll() is None, actor.output
-    status = start("status", "--connect", address, "--json")
-    status.wait()
-    (line,) = status.lines
+    (line,) = here("status", "--connect", address, "--json").lines
     assert json.loads(line)["actors_alive"] == 2
     for actor in actors:
         os.kill(actor.process.pid, signal.SIGUSR1)  # as their hosts do that end
