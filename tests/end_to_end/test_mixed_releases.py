@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 from installing import build, installed, run
-from processes import DAEDALUS, ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, until
+from learner_status import env_steps, learner_status
+from processes import DAEDALUS, ENDLESS, PLAYING_SLOW, SLOW, Running, free_address, here, until
 
 from daedalus.learner.run.setting_errors import known_names
 from daedalus.protocol.releases import REPLACED_SETTINGS, own_release
@@ -69,10 +70,10 @@ def test_a_fleet_is_upgraded_host_by_host_without_a_pause_for_its_actors(start: 
     learner.expect("actor=new: joined")
     status = start("status", "--connect", address)
     status.expect(f"releases: unknown: the learner; daedalus-rl 0.0.1: 1 actor; {own}: 1 actor")
-    assert start("drain", "new", "--connect", address).wait() == 0
+    assert here("drain", "new", "--connect", address).status == 0
     assert newer.wait() == 0, newer.output
-    learner.expect(r"updates .*/s")
-    assert start("stop", "run", "--connect", address).wait() == 0
+    until(lambda: env_steps(learner_status(address), "old") > 0)  # that the learner has trained on
+    assert here("stop", "run", "--connect", address).status == 0
     assert learner.wait() == 0, learner.output
     upgraded = start("learner", "--connect", address, "--run-dir", "run", "--resume")
     upgraded.expect("resuming from checkpoint [1-9]")
@@ -115,7 +116,7 @@ def test_too_old_processes_name_the_release_that_they_need(start: Start, address
     waits.expect(f"{reason}; trying again")
     assert refused.wait() == 1
     refused.expect(f"^daedalus actor: the learner refused this actor: {reason}$")
-    status = start("status", "--connect", address)
+    status = here("status", "--connect", address)
     status.expect("run later: .*, daedalus-rl 9.9$")
     status.expect("refused: newer .*daedalus-rl 9.9")  # by ours
     status.expect(rf"refused: too-old\S* .*{own}")  # as it reports to the later one
