@@ -23,8 +23,8 @@ def test_sac_trains_with_defaults_and_resumes_with_its_buffer(start: Callable[..
     shown = MinariWriter(str(tmp_path / "shown"), pendulum.observation_space, pendulum.action_space, pendulum.spec)
     still = np.tile(np.array([[1.0, 0.0, 0.0]], np.float32), (6, 1))
     shown.add(Episode(still, np.zeros((5, 1), np.float32), np.zeros(5), terminated=False, truncated=True))
-    options = ("--algorithm", "sac", "--env-steps", 300, *SHORT, "--run-dir", "r", "--demonstrations", "./shown")
-    running = start("train", "--env", "Pendulum-v1", *options)
+    options = ("--algorithm", "sac", "--env-steps", 300, "--actors", 1, *SHORT, "--run-dir", "r")
+    running = start("train", "--env", "Pendulum-v1", *options, "--demonstrations", "./shown")
     assert running.wait() == 0, running.output
     done = summary(tmp_path / "r")
     assert 300 <= done["env_steps"] < 400
