@@ -58,10 +58,13 @@ class Command:
         """Return the parser of the command."""
         return _found(self.parser)()
 
+    def load(self) -> Callable[[list[str]], int]:
+        """Import the command, and return the function that runs it in this process and returns its exit status."""
+        return _found(self.function)
+
     def run(self, arguments: list[str]) -> int:
         """Run the command in this process and return its exit status."""
-        run: Callable[[list[str]], int] = _found(self.function)
-        return run(arguments)
+        return self.load()(arguments)
 
 
 def _found(place: str) -> Any:

@@ -1,5 +1,6 @@
 """`daedalus COMMAND`: finds the command and runs it. Imports nothing that the command does not need."""
 
+import gc
 import os
 import sys
 
@@ -33,7 +34,11 @@ def _run() -> int:
         return 2
     if COMMANDS[command].function:
         exit_on_thread_exceptions()
-        return COMMANDS[command].run(rest)
+        gc.disable()  # what is imported is kept: the collector would look through it again and again
+        run = COMMANDS[command].load()
+        gc.freeze()
+        gc.enable()
+        return run(rest)
     line = [sys.executable, "-P", "-m", f"daedalus.cli.commands.{command}", *rest]
     if sys.platform == "win32" or not hasattr(os, "execv"):  # Windows would return to the shell at once
         import subprocess

@@ -246,6 +246,7 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     """
     open_standard_streams()
     gc.freeze()  # what has been imported: the interpreter would look through it again, also at its end
+    gc.enable()  # see cli/commands/__init__.py
     before = set(threading.enumerate())
     try:
         try:

@@ -89,7 +89,7 @@ def dropping_in_the_background():
 def build(_arguments):
     BUILD()
 
-main.COMMANDS["plot"] = types.SimpleNamespace(function="build", run=build)
+main.COMMANDS["plot"] = types.SimpleNamespace(function="build", load=lambda: build)
 sys.argv[1:] = ["plot"]
 sys.exit(main.main())
 """

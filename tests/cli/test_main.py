@@ -1,6 +1,7 @@
 """cli/main.py: the command that a command line names; and words of options that are refused, with their errors."""
 
 import argparse
+import gc
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import pytest
 import daedalus
 from daedalus.cli import main
 from daedalus.cli.commands import actor, orders, router
+from daedalus.launch.process_lifecycle import exit_status
 
 
 def test_version_is_that_of_the_package(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,6 +32,20 @@ def test_python_m_daedalus_is_daedalus_also_beside_a_file_that_is_named_like_a_m
         ended = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert ended.returncode == status, ended
         assert (ended.stdout + ended.stderr).startswith(printed)
+
+
+def test_the_garbage_collector_that_imports_do_without_is_on_while_a_command_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def state(*_arguments: object) -> int:
+        return 7 if gc.isenabled() else 1
+
+    monkeypatch.setattr("sys.argv", ["daedalus", "router"])
+    monkeypatch.setattr(main, "exit_on_thread_exceptions", lambda: None)
+    monkeypatch.setattr(router, "router", state)
+    assert main.main() == 7
+    gc.disable()  # as in `python -m daedalus.cli.commands.actor`
+    assert exit_status(state) == 7
 
 
 @pytest.mark.parametrize("parser", [actor.parser, orders.drain_parser])
