@@ -13,45 +13,29 @@ from certificates import make_certificates
 from processes import DAEDALUS, LIMIT, Running, until
 
 from daedalus.cli.command_table import COMMANDS
-from daedalus.cli.commands.actor import actor_options, parser
+from daedalus.cli.commands.actor import _run_group, actor_options, parser
+from daedalus.cli.commands.learner import learner_options
+from daedalus.cli.commands.learner import parser as learner_parser
 from daedalus.launch.actor_process import LeaveRequest, run_actor
+from daedalus.launch.learner_process import LearnerProcess
+from daedalus.learner.reporting.user_metrics import UserMetrics
+from daedalus.learner.run.settings import SettingsError
 from daedalus.transport.zenoh_transport import listen
 
 Start = Callable[..., Running]
+
+
+def test_an_actor_that_finds_nobody_says_so_in_one_line(start: Start) -> None:
+    running = start("actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3")
+    assert running.wait() == 1, running.output
+    running.expect(r"nothing answers at tcp/127.0.0.1:1: is the learner or router running, .* \(tried for 0.3 s\)")
+    assert len(running.lines) == 1, running.output
 
 
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [
         (["train", "cartpol"], 2, r"unknown preset 'cartpol': did you mean cartpole"),
-        (["learner", "cartpole", "--algorithm", "absent:A"], 2, "training.algorithm=absent:A: cannot import absent"),
-        (
-            ["actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3"],
-            1,
-            r"nothing answers at tcp/127.0.0.1:1: is the learner or router running, .* \(tried for 0.3 s\)",
-        ),
-        (["actor", "--connect", "tcp/127.0.0.1:1", "--actors", "0"], 2, r"--actors is 0: choose a number from 1"),
-        (
-            ["actor", "--connect", "tcp/127.0.0.1:1", "--inference", "cuda", "--runtime", "onnx"],
-            2,
-            r"--inference cuda runs the policy with torch: leave out --runtime onnx",
-        ),
-        (["trian"], 2, r"unknown command 'trian': did you mean train"),
-    ],
-)
-def test_a_mistake_is_reported_in_one_line(
-    start: Start, tmp_path: Path, words: list[str], status: int, message: str
-) -> None:
-    running = start(*words)
-    assert running.wait() == status, running.output
-    running.expect(message)
-    assert len(running.lines) == 1, running.output
-    assert not [entry for entry in tmp_path.iterdir() if entry.is_dir()]  # no run was started
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "message"),
-    [
         (["train", "cartpole", "--set", "learning_rate=7"], 2, r"write section.key=value"),
         (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
         (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
@@ -95,6 +79,24 @@ def test_an_actor_reports_a_mistake_in_one_line(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (("--actors", "0"), "--actors is 0: choose a number from 1"),
+        (
+            ("--inference", "cuda", "--runtime", "onnx"),
+            "--inference cuda runs the policy with torch: leave out --runtime onnx",
+        ),
+    ],
+)
+def test_a_group_of_actors_reports_a_mistake_in_one_line(
+    capsys: pytest.CaptureFixture[str], words: tuple[str, ...], message: str
+) -> None:
+    assert _run_group(parser().parse_args(["--connect", "tcp/127.0.0.1:1", *words])) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"daedalus actor: {message}")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
         (["CartPoll-v1"], "unknown environment 'CartPoll-v1': did you mean CartPole-v1"),
         (
             ["faulty_environments:Faulty-v0", "--set", "environment.kwargs.fault=shape"],
@@ -125,15 +127,12 @@ def test_a_signal_ends_the_check_of_an_environment_that_hangs(start: Start, tmp_
     assert not (tmp_path / "run").exists()
 
 
-def test_a_missing_cuda_device_is_reported_in_one_line(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # also on a machine with a GPU
-    running = start("train", "cartpole", "--set", "training.device=cuda", "--run-dir", "run")
-    assert running.wait() == 1
-    running.expect("daedalus learner: training.device is cuda, but torch finds no CUDA device: install")
-    assert "Traceback" not in running.output
-    assert not (tmp_path / "run").exists()  # a failed start leaves nothing
+def test_a_learner_whose_algorithm_cannot_be_imported_starts_no_run(tmp_path: Path) -> None:
+    words = ["cartpole", "--algorithm", "absent:A", "--run-dir", str(tmp_path / "run")]
+    options = learner_options(learner_parser().parse_args(words), 0.0, tmp_path)
+    with pytest.raises(SettingsError, match=r"training\.algorithm=absent:A: cannot import absent"):
+        LearnerProcess(options, threading.Event(), UserMetrics())
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_path: Path) -> None:
@@ -145,11 +144,14 @@ def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_
     assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["precious"]
 
 
-def test_an_address_in_use_is_reported(start: Start, address: str, tmp_path: Path) -> None:
+def test_a_training_whose_learner_fails_at_its_start_says_why_and_leaves_nothing(
+    start: Start, address: str, tmp_path: Path
+) -> None:
     with closing(listen([address])):
-        learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
-        assert learner.wait() == 1
-    learner.expect(f"address {address} is already in use")
+        running = start("train", "cartpole", "--listen", address, "--actors", 1, "--run-dir", "run")
+        assert running.wait() == 1
+    running.expect(f"daedalus learner: address .*, {address} is already in use")
+    assert "Traceback" not in running.output
     assert not (tmp_path / "run").exists()
 
 

@@ -5,33 +5,37 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 from learner_status import env_steps, learner_status
 from processes import ENDLESS, PLAYING_SLOW, SLOW, Running, here, until
 
 Start = Callable[..., Running]
-LOGGED = ("--log", "wandb")
+TRACKER = """
+class Nowhere:
+    def __init__(self, run): pass
+    def write(self, row, details): pass
+    def close(self): pass
+"""
 
 
-def test_an_actor_that_starts_before_the_learner_waits_for_it(
-    start: Start, address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("WANDB_MODE", "offline")
+def test_an_actor_that_starts_before_the_learner_waits_for_it(start: Start, address: str, tmp_path: Path) -> None:
+    (tmp_path / "metrics.py").write_text(TRACKER)
     actor = start("actor", "--connect", address, "--name", "early")
     actor.expect("waiting for it")
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 8000, *LOGGED)
+    logged = ("--log", "metrics:Nowhere")
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 8000, *logged)
     actor.expect("joined run 'run' as 'early': 128 x CartPole-v1")
     assert learner.wait() == 3, learner.output
     assert actor.wait() == 0, actor.output
     actor.expect("the run is over")
     time = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
     for line in learner.lines:
-        line = re.sub(r" tracker run=run: (?=wandb: recorded offline; )", " learner run=run: ", line)
+        line = re.sub(r" tracker run=run: (?=metrics:Nowhere: metrics go to )", " learner run=run: ", line)
         assert re.match(rf"{time} (info|warning) learner run=run( epoch=[0-9a-f]+)?( actor=early)?: ", line), line
     for line in actor.lines:
         assert re.match(rf"{time} (info|warning) actor actor=early( run=run epoch=[0-9a-f]+)?: ", line), line
     epochs = {match[1] for line in learner.lines + actor.lines if (match := re.search("epoch=([0-9a-f]+)", line))}
     assert len(epochs) == 1
+    learner.expect(" tracker run=run: metrics:Nowhere: metrics go to metrics:Nowhere")
     learner.expect(r"epoch=\w+ actor=early: joined with 128 environments \(.*daedalus-rl ")
 
 

@@ -32,7 +32,7 @@ from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.serving.events import read_events
 
 Start = Callable[..., Running]
-TARGET = 195  # mean return; an untrained policy has about 20
+TARGET, EPISODES = 120, 40  # mean return of so many episodes; an untrained policy has about 20
 SHORT = ("--set", "collection.envs_per_actor=2", "--set", "evaluation.final_episodes=0")
 
 
@@ -90,8 +90,11 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         # More than the budget of the preset: asynchronous runs differ, and these tests do not check the speed of
         # learning.
         # Of a lower target, which takes a fraction of the time.
-        target = ("--set", f"training.target_return={TARGET}")
-        running = start("train", "cartpole", "--env-steps", 4_000_000, "--run-dir", "solved-run", *target, report=True)
+        target = ("--set", f"training.target_return={TARGET}", "--set", f"training.target_episodes={EPISODES}")
+        final = ("--set", "evaluation.final_episodes=20")
+        running = start(
+            "train", "cartpole", "--env-steps", 4_000_000, "--run-dir", "solved-run", *target, *final, report=True
+        )
         assert running.wait() == 0, running.output
     assert "UNPICKLED" not in running.output
     return folder / "solved-run", running.output
@@ -102,22 +105,21 @@ def test_cartpole_is_solved_and_evaluated(solved: tuple[Path, str]) -> None:
     result = summary(directory)
     assert result["solved"] is True
     assert result["episode_return_mean"] >= TARGET
-    assert (
-        result["evaluation_return_mean"] > 100
-    )  # an untrained policy has 10. Greedy actions differ from the sampled actions of training
+    # An untrained policy has 10. Greedy actions differ from the sampled actions of training.
+    assert result["evaluation_return_mean"] > 60
     assert 0 < result["seconds_to_target"] <= result["wall_seconds"]
     assert result["rollouts_rejected"] == {}
     assert result["snapshots_published"] == result["updates"] + 1
     assert f"solved: mean return {TARGET} reached" in output
     confirmation = result["confirmation"]
-    assert confirmation["episodes"] == 100
+    assert confirmation["episodes"] == EPISODES
     assert confirmation["interval"][1] >= TARGET
     seed = confirmation["seed"]
-    again = evaluate(confirmation["checkpoint"], actions="sampled", seed=seed, episodes=100)
+    again = evaluate(confirmation["checkpoint"], actions="sampled", seed=seed, episodes=EPISODES)
     assert seed not in (1, 1 + 2**32, 1 + 2**33)  # training, the final evaluation, the selection
     assert (again.return_mean, again.return_std) == (confirmation["return_mean"], confirmation["return_std"])
     assert again.policy_version == confirmation["policy_version"]
-    assert "over 100 new sampled episodes of the policy at that moment, 95 % interval" in output
+    assert f"over {EPISODES} new sampled episodes of the policy at that moment, 95 % interval" in output
     assert "evaluation: return" in output
 
 
@@ -182,7 +184,9 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
     config = (tmp_path / "run" / "config.toml").read_text()
     refused = start("resume", "run", "--env-steps", 12000, "--set", "training.device=cuda")
     assert refused.wait() == 1, refused.output
+    refused.expect("daedalus learner: training.device is cuda, but torch finds no CUDA device: install")
     refused.expect("config.toml has the settings from before again")
+    assert "Traceback" not in refused.output
     assert (tmp_path / "run" / "config.toml").read_text() == config
 
     changed = ("--set", "training.learning_rate_final=0.0001", "--set", "evaluation.final_episodes=2")
@@ -204,7 +208,8 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_tracker
 
 
 def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ended(start: Start, tmp_path: Path) -> None:
-    running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS, *SLOW, "--inference", "shared")
+    words = ("train", "cartpole", "--run-dir", "orphan-run", "--actors", 1, "--inference", "shared")
+    running = start(*words, *ENDLESS, *SLOW)
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
     assert not any(map(listening_ports, processes_mentioning("orphan-run")))  # every user could connect there
