@@ -218,7 +218,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import daedalus
 settings = {"training.stop_when_solved": False, "environment.id": "slow_environment:Slow-v0"}
 try:
-    daedalus.train("cartpole", run_dir="interrupted-run", env_steps=10**9, settings=settings)
+    daedalus.train("cartpole", run_dir="interrupted-run", env_steps=10**9, actors=1, settings=settings)
 finally:
     print(logging.getLogger("daedalus").handlers, flush=True)
 """
