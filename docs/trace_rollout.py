@@ -8,6 +8,7 @@ because a moved function is no reason to change a page.
 
 import argparse
 import collections
+import functools
 import importlib.util
 import re
 import sys
@@ -15,7 +16,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import CodeType, FrameType, ModuleType
 from typing import Any
 
 import gymnasium
@@ -65,7 +66,7 @@ class Tracer:
 
     def on_call(self, frame: FrameType, event: str, _argument: Any) -> None:
         """See sys.setprofile."""
-        if self._recording and event == "call" and (function := _ours(frame)):
+        if self._recording and event == "call" and (function := _ours(frame.f_code)):
             self._count(threading.get_ident(), function, frame)
 
     def on_step(self) -> None:
@@ -79,7 +80,7 @@ class Tracer:
             # The loops, whose calls have not ended in all this time, are on the way of every rollout too.
             for thread, frame in sys._current_frames().items():
                 for each in _callers(frame):
-                    if each in self._around.get(thread, []) and (function := _ours(each)):
+                    if each in self._around.get(thread, []) and (function := _ours(each.f_code)):
                         self._count(thread, function, each)
                         self._rollouts[thread][function] |= {*_ROLLOUTS}
         self._recording = recording
@@ -99,9 +100,9 @@ class Tracer:
         self._places[thread][function] = min(place, self._places[thread].get(function, place))
 
 
-def _ours(frame: FrameType) -> Function | None:
-    """Return the function of a frame, or None if it is none of ours, or one without a name."""
-    code = frame.f_code
+@functools.cache
+def _ours(code: CodeType) -> Function | None:
+    """Return the function of some code, or None if it is none of ours, or one without a name."""
     if not code.co_filename.startswith(_PACKAGE) or code.co_name.startswith("<"):
         return None
     return str(Path(code.co_filename).resolve().relative_to(ROOT)), code.co_qualname.replace(".<locals>", "")

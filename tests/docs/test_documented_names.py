@@ -1,8 +1,8 @@
 """Names and the wire format that the documentation shows are those of the code."""
 
 import dataclasses
+import importlib
 import re
-import subprocess
 import sys
 import typing
 from pathlib import Path
@@ -32,28 +32,27 @@ def anchor(heading: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_files_and_settings_exist(page: Path) -> None:
     for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
-        if re.match(r"\w+:", link):
-            continue
-        path, _, part = link.partition("#")
-        target = (page.parent / path) if path else page
-        assert target.exists(), link
-        if part and target.suffix == ".md":
-            headings = re.findall(r"^#+ (.*)$", target.read_text("utf-8"), re.MULTILINE)
-            assert part in {anchor(heading) for heading in headings}, link
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_files_exist(page: Path) -> None:
+        if not re.match(r"\w+:", link):
+            check_link(page, link)
     for code in inline_code(page.read_text("utf-8")):
         for path in re.findall(rf"(?:^|\s)((?:{FOLDERS})/[\w./@-]*)", code):
             if "NAME" not in path and not path.startswith(ZENOH_SETTINGS):
                 assert (ROOT / path).exists(), path
+    check_settings(page)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_settings_exist(page: Path) -> None:
+def check_link(page: Path, link: str) -> None:
+    path, _, part = link.partition("#")
+    target = (page.parent / path) if path else page
+    assert target.exists(), link
+    if part and target.suffix == ".md":
+        headings = re.findall(r"^#+ (.*)$", target.read_text("utf-8"), re.MULTILINE)
+        assert part in {anchor(heading) for heading in headings}, link
+
+
+def check_settings(page: Path) -> None:
     text = page.read_text("utf-8")
     codes = [*inline_code(text), *code_blocks(text)]
     sections = "|".join(RunSpec.model_fields)
@@ -87,11 +86,14 @@ def test_the_files_to_open_have_what_is_named_in_them() -> None:
         assert re.search(pattern, (ROOT / path).read_text("utf-8"), re.MULTILINE), f"{path} {name}"
 
 
-def test_the_way_of_a_rollout_is_the_one_that_is_traced() -> None:
+def test_the_way_of_a_rollout_is_the_one_that_is_traced(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """See docs/trace_rollout.py, which names what is missing and what is superfluous."""
-    command = [sys.executable, str(DOCS / "trace_rollout.py"), "--check"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
+    monkeypatch.syspath_prepend(str(DOCS))
+    monkeypatch.setattr(sys, "argv", ["trace_rollout.py", "--check"])
+    status = importlib.import_module("trace_rollout").main()
+    assert status == 0, capsys.readouterr()
 
 
 WIRE = (DOCS / "wire.md").read_text("utf-8")
