@@ -130,19 +130,21 @@ def test_curves_appear_and_a_killed_actor_shows_as_gone(run: tuple[Run, Callable
     wait_for(page, "document.querySelectorAll('#charts .line').length >= 5")
     wait_for(page, "document.querySelector('#state').textContent === 'running'")
     assert text_of(page, "#run") == "run"
-    actor = start("actor", "--connect", watched.learner, "--name", "fragile")
-    row = "tr:has(td:text-is('fragile'))"
-    page.wait_for_selector(f"{row}[data-state='alive']", timeout=MILLISECONDS)
-    actor.process.send_signal(signal.SIGKILL)
-    page.wait_for_selector(f"{row}[data-state='gone']", timeout=MILLISECONDS)
-    page.wait_for_selector("#log li:has-text('fragile'):has-text('left')", timeout=MILLISECONDS)
+    with watched.still():
+        actor = start("actor", "--connect", watched.learner, "--name", "fragile")
+        row = "tr:has(td:text-is('fragile'))"
+        page.wait_for_selector(f"{row}[data-state='alive']", timeout=MILLISECONDS)
+        actor.process.send_signal(signal.SIGKILL)
+        page.wait_for_selector(f"{row}[data-state='gone']", timeout=MILLISECONDS)
+        page.wait_for_selector("#log li:has-text('fragile'):has-text('left')", timeout=MILLISECONDS)
 
 
 def test_a_page_that_is_opened_late_shows_the_run_from_its_begin(
     run: tuple[Run, Callable[..., Running]], visit: Open
 ) -> None:
-    page = enter(visit(run[0].address).page, run[0].token)
-    wait_for(page, "document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
+    with run[0].still():
+        page = enter(visit(run[0].address).page, run[0].token)
+        wait_for(page, "document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
     label = page.locator("#charts svg").first.get_attribute("aria-label")
     assert "from" in label
 
