@@ -266,7 +266,7 @@ def test_a_replay_buffer_has_all_rollouts_that_were_accepted_before_a_stop(
 
 def test_a_run_ends_when_all_updates_of_its_budget_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gradients = Sac.gradients
-    monkeypatch.setattr(Sac, "gradients", lambda *given: time.sleep(0.01) or gradients(*given))
+    monkeypatch.setattr(Sac, "gradients", lambda *given, **named: time.sleep(0.01) or gradients(*given, **named))
     monkeypatch.setattr(replay_learner, "_SLICE_SECONDS", 0.005)  # one update, so that some are left
     training_run = TrainingRun(
         tmp_path,
