@@ -38,11 +38,10 @@ class Moments(NamedTuple):
     number: int | Tensor  # of values, or their weights [*shape]
     mean: Tensor  # [*shape]
     squares: Tensor  # [*shape]
-    nonzero: Tensor | None = None  # the number of those that are not 0 [*shape]; None: it is not asked for
 
 
 def moments_of(values: Tensor) -> Moments:
-    """Return the moments of values [N, *shape], without `nonzero`; those of no values are 0."""
+    """Return the moments of values [N, *shape]; those of no values are 0."""
     rows = max(_PART_NUMBERS // max(values[:1].numel(), 1), 1)
     if len(values) > rows:  # in float64 all of them, such as a batch of images, could take gigabytes
         merged = RunningMoments(tuple(values.shape[1:]), most=math.inf)
@@ -65,18 +64,12 @@ class RunningMoments:
         self.mean = torch.zeros(shape, dtype=torch.float64)
         self.squares = torch.zeros(shape, dtype=torch.float64)  # sum of squared deviations from the mean
         self.count = torch.zeros(shape, dtype=torch.float64)
-        self.nonzero = torch.zeros(shape, dtype=torch.float64)  # of `count`; all of it where moments do not say
         self._most = most
 
     @property
     def variance(self) -> Tensor:
         """Variance [*shape]; 1 before any value was seen."""
         return torch.where(self.count > 0, self.squares / self.count.clamp(min=1e-300), 1.0)
-
-    @property
-    def nonzero_variance(self) -> Tensor:
-        """The variance divided by the share of the values that are not 0 [*shape]; 1 before any value was seen."""
-        return torch.where(self.count > 0, self.squares / self.nonzero.clamp(min=1e-300), 1.0)
 
     def add(self, values: Tensor) -> None:
         """Add values [N, *shape]."""
@@ -88,21 +81,19 @@ class RunningMoments:
         kept = ((self._most - number) / self.count.clamp(min=1.0)).clamp(0.0, 1.0)
         self.count *= kept
         self.squares *= kept
-        self.nonzero *= kept
         total, difference = (self.count + number).clamp(min=1e-300), others.mean - self.mean
         self.squares += others.squares + difference.square() * self.count * number / total
         self.mean += difference * number / total
         self.count += number
-        self.nonzero += number if others.nonzero is None else others.nonzero
 
     def forget(self, which: Tensor) -> None:
         """Forget all that was seen in some of the numbers, a mask [*shape]."""
-        for values in (self.mean, self.squares, self.count, self.nonzero):
+        for values in (self.mean, self.squares, self.count):
             values.masked_fill_(which, 0.0)
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for a checkpoint."""
-        return {"mean": self.mean, "squares": self.squares, "count": self.count, "nonzero": self.nonzero}
+        return {"mean": self.mean, "squares": self.squares, "count": self.count}
 
 
 class ConfirmedRange:
@@ -229,8 +220,7 @@ class ConfirmedRange:
         share, middle = torch.from_numpy(np.asarray(shares)), torch.from_numpy(np.asarray(center))
         mean = torch.where(share < 1.0, middle + share * (moments.mean - middle), moments.mean)
         # Squares are a sum over the rows, which are fewer as well.
-        nonzero = None if moments.nonzero is None else moments.nonzero * share
-        return Moments(moments.number * share, mean, share**3 * moments.squares, nonzero)
+        return Moments(moments.number * share, mean, share**3 * moments.squares)
 
     def _summarized(self) -> "_Summary":
         if self._summary is None:
@@ -423,15 +413,10 @@ def observations_name(component: str) -> str:
 
 
 class ObservationStatistics:
-    """The statistics of a network's ObservationNormalizer, updated from batches.
+    """The statistics of a network's ObservationNormalizer, updated from batches."""
 
-    With `sparse`, a number that is 0 in most rows, such as a force of contact, is divided by s / p^(1/2) in place of
-    its deviation s, where p is the share of the rows in which it is not 0: by about its size in these. Divided by s,
-    many such numbers would be the largest of all, and hide what is always there (docs/results.md).
-    """
-
-    def __init__(self, normalizer: ObservationNormalizer, *, sparse: bool = False) -> None:
-        self._normalizer, self._sparse = normalizer, sparse
+    def __init__(self, normalizer: ObservationNormalizer) -> None:
+        self._normalizer = normalizer
         self.moments = {
             name: RunningMoments(tuple(scale.shape))
             for name, scale in zip(normalizer.names, normalizer.scales, strict=True)
@@ -444,16 +429,11 @@ class ObservationStatistics:
             moments.mean.copy_(mean)
             moments.squares.copy_(variance * _LOADED_COUNT)
             moments.count.fill_(_LOADED_COUNT)
-            moments.nonzero.fill_(_LOADED_COUNT)  # the variance is that of what was divided by
 
     def moments_of(self, batch: Batch, columns: slice = slice(None)) -> dict[str, Moments]:
         """Return the moments of the observations of the valid rows of some environments, by component."""
         rows = batch.valid[:, columns].bool()
-        return {name: self._moments_of(batch.observations[name][:-1, columns][rows]) for name in self.moments}
-
-    def _moments_of(self, values: Tensor) -> Moments:
-        moments = moments_of(values)
-        return moments._replace(nonzero=(values != 0).sum(0, dtype=torch.float64).cpu()) if self._sparse else moments
+        return {name: moments_of(batch.observations[name][:-1, columns][rows]) for name in self.moments}
 
     def merge(self, parts: Mapping[str, Sequence[Moments]], ranges: ConfirmedRanges) -> None:
         """Add observations by the moments of their rollouts, by component, and set the normaliser's statistics.
@@ -462,23 +442,19 @@ class ObservationStatistics:
         """
         for name, moments in self.moments.items():
             ranges.merge(observations_name(name), parts[name], moments)
-            self._set(name)
+            self._normalizer.set_statistics(name, moments.mean, moments.variance)
 
     def add(self, observations: Mapping[str, Tensor]) -> None:
         """Add observations that nobody doubts, by component [N, *stacked_shape], and set the statistics."""
         for name, moments in self.moments.items():
-            moments.merge(self._moments_of(observations[name]))
-            self._set(name)
+            moments.merge(moments_of(observations[name]))
+            self._normalizer.set_statistics(name, moments.mean, moments.variance)
 
     def reset(self) -> None:
         """Forget all observations."""
         for name, moments in self.moments.items():
             moments.forget(moments.count > 0)
-            self._set(name)
-
-    def _set(self, name: str) -> None:
-        moments = self.moments[name]
-        self._normalizer.set_statistics(name, moments.mean, moments.nonzero_variance)
+            self._normalizer.set_statistics(name, moments.mean, moments.variance)
 
 
 class RewardNormalizer:

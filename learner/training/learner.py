@@ -194,7 +194,7 @@ class Learner:
         self.graphs = UpdateGraphs(self.device, can_record=built_in and not changes)
         self._pending: _Pending | None = None  # the newest batch, until it is known that its gradients were finite
         self._assembler = BatchAssembler(spaces, self.device)
-        self._observations = ObservationStatistics(self._network.normalizer, sparse=spec.record.replay)
+        self._observations = ObservationStatistics(self._network.normalizer)
         self._rewards: RewardNormalizer | None = None
         if spec.normalize_rewards:
             self._rewards = RewardNormalizer(spec.discount_factor, synchronous=spec.record.synchronous)
@@ -631,9 +631,7 @@ class Learner:
             saved = state.get(name)
             if saved is None and name.startswith(_CURIOSITY):
                 continue  # the run was not curious before
-            if saved is None and name.endswith("/nonzero"):
-                saved = state.get(name.removesuffix("nonzero") + "count")  # in earlier releases it was not counted
-            if saved is not None and name.endswith(("/count", "/nonzero")) and not saved.shape:
+            if saved is not None and name.endswith("/count") and not saved.shape:
                 saved = saved.expand(statistic.shape)  # in checkpoints of earlier releases: one count for all numbers
             if saved is None or saved.shape != statistic.shape:
                 remedy = "training.optimizer, training.normalize_rewards and policy.normalize_observations of the run"

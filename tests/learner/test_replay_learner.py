@@ -318,25 +318,6 @@ def test_critics_read_codes_as_the_policy_does() -> None:
     assert learner.policy_version > 0
 
 
-def test_numbers_that_are_mostly_0_stay_small() -> None:
-    """A number that is 0 in 7 of 8 rows, and else 2; beside it numbers that are never 0."""
-    learner = ReplayLearner(spec_of({"policy": POLICY | {"normalize_observations": True}}), SPACES)
-    for seed in range(8):
-        one = rollout(seed)
-        frames = one.frames["observation"]
-        frames[:, :, 0] = 0.0
-        frames[1, 1, 0] = 2.0
-        learner.step([one], 0.0)
-    scales = learner.weights()["normalizer.scales.0"]
-    assert scales[0] == pytest.approx(0.5 / (1 - 1 / 8) ** 0.5, rel=2**-7)
-    state = learner.state()
-    counted = state.pop("observations/observation/nonzero")
-    assert counted.tolist() == [8.0, 64.0, 64.0]
-    earlier = ReplayLearner(spec_of({"policy": POLICY | {"normalize_observations": True}}), SPACES)
-    earlier.restore(7, learner.weights(), state)  # of a run before they were counted
-    assert earlier.state()["observations/observation/nonzero"].tolist() == [64.0] * 3
-
-
 def test_a_damaged_part_is_left_out_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     spec = spec_of()
     learner = trained(ReplayLearner(spec, SPACES), 0)
