@@ -154,9 +154,13 @@ def test_rollouts_of_many_seats_are_no_larger(where: Spaces, seats: int, rows: i
 
 def test_maps_are_convolved_where_actions_are_choices() -> None:
     board = ArraySpace(shape=(10, 10, 4), dtype="float32")
-    assert default_settings(spaces(CHOICES, board), maps=["observation"])["policy"]["encoder"] == "grid"
+    settings = default_settings(spaces(CHOICES, board), maps=["observation"])
+    assert settings["policy"]["encoder"] == "grid"
+    assert (settings["training"]["passes"], settings["training"]["learning_rate_final"]) == (4, 0.0)
     for where, maps in ((spaces(CHOICES, board), []), (spaces(JOINTS, board), ["observation"])):
-        assert "encoder" not in default_settings(where, maps=maps)["policy"]
+        settings = default_settings(where, maps=maps)
+        assert "encoder" not in settings["policy"]
+        assert settings["training"]["passes"] == 10
 
 
 def test_components_to_leave_out_become_a_setting() -> None:
