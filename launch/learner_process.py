@@ -168,7 +168,7 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     if directory is None:
         spec = new.choice.spec()
         directory = new.directory or new.choice.directory(spec)
-        run_directory.check_free(directory)
+        run_directory.check_free(directory, "daedalus learner --resume --run-dir")
         changed = []
     else:
         before = run_directory.read_config(directory)

@@ -118,7 +118,7 @@ class SessionThread:
 
     def _check_stop(self) -> None:
         if self._stop.is_set():
-            raise RunOverError("stopped")
+            raise RunOverError("this process was stopped")
 
     def _step(self, step: Callable[[], Any]) -> Any:
         """Pass on the time and what was published, and make a step; return its action."""

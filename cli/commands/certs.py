@@ -42,7 +42,7 @@ One CA is one trust domain: the certificates above are for all runs of a router.
   daedalus certs issue operator ann --run alice   reads and orders these runs only
 
 The certificate of an actor allows it to play under its name NAME or NAME.ANYTHING. The certificate of an operator
-allows `daedalus status` and `daedalus exporter`; the token beside it is for the buttons on the page of a gateway.
+allows `daedalus status`, `exporter`, `checkpoint`, `stop` and `drain`; its token is for the page of a gateway.
 Learners and routers notice within seconds that a file in their folder has changed: after `issue` and `revoke`, copy
 {CLIENTS} to their folders if they run elsewhere. Nothing has to be restarted. A renewed certificate is used from the
 next connection on. A client of a gateway has a token in place of a certificate, valid for its name NAME and for
@@ -148,7 +148,7 @@ def _init(parsed: argparse.Namespace) -> list[str]:
         f"{directory}/ca          the keys of the CA: keep them secret",
         f"{directory}/learner     for the option --tls of daedalus learner",
         f"{directory}/router      for the option --tls of daedalus router",
-        f"{directory}/operator    for the option --tls of daedalus status and exporter",
+        f"{directory}/operator    for the option --tls of daedalus status, exporter, checkpoint, stop and drain",
         f"valid for {', '.join(folder.hosts(Identity('learner')))}; "
         f"next: daedalus certs issue actor NAME --directory {shlex.quote(str(directory))}",
     ]

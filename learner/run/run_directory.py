@@ -89,15 +89,18 @@ def role_directories(parent: Path) -> dict[str, Path]:
     return {run.name.removeprefix(prefix): run for run in runs if run.name.startswith(prefix)}
 
 
-def check_free(directory: Path) -> None:
-    """Check that a directory is free for a new run. Raises SettingsError if it is a file or not empty."""
+def check_free(directory: Path, again: str = "daedalus resume") -> None:
+    """Check that a directory is free for a new run. Raises SettingsError if it is a file or not empty.
+
+    `again` is the command that continues a run, without its directory: the error names it.
+    """
     if not directory.exists():
         return
     if not directory.is_dir():
         raise SettingsError(f"run directory {directory} is a file: choose a directory with --run-dir")
     if (directory / CONFIG).exists():
         raise SettingsError(
-            f"run directory {directory} exists: continue the run with `daedalus resume {shlex.quote(str(directory))}`, "
+            f"run directory {directory} exists: continue the run with `{again} {shlex.quote(str(directory))}`, "
             "or choose another directory with --run-dir"
         )
     if role_directories(directory):
