@@ -520,7 +520,7 @@ class LeagueSpec(Specification):
     keep_env_steps: PositiveInt | None = None
     """Keep a version after this many env_steps. Unset: a fiftieth of `training.env_steps`."""
     versions: Annotated[int, Field(ge=1, le=256)] = 20
-    """Number of versions to keep. Beyond it, those go that are nearest to their neighbours in env_steps."""
+    """Number of versions to keep. Beyond it, the version nearest to its neighbours in env_steps is removed."""
     rating_share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.01
     """Share of the matches that are only played to rate the players, and not learned from."""
     rating_actions: Literal["sampled", "greedy"] = "sampled"

@@ -104,7 +104,7 @@ def load(directory: Path, *roles: str) -> Credentials:
     if role not in roles:
         raise CredentialsError(
             f"{directory} holds the certificate of {_described(role, name)}, but {' or '.join(roles)} is required: "
-            f"issue one (daedalus certs issue {roles[0]})"
+            f"name the folder of such a certificate, or issue one (daedalus certs issue {roles[0]})"
         )
     # It is read again later, when the code of a user may have changed the working directory.
     return Credentials(Path(os.path.abspath(directory)), role, name, run)
@@ -177,7 +177,9 @@ def _validity(directory: Path) -> Validity:
     try:
         return _read_validity(directory, (directory / CERTIFICATE).stat().st_mtime_ns)
     except OSError:
-        raise CredentialsError(f"{directory} has no {CERTIFICATE}") from None
+        raise CredentialsError(
+            f"{directory} has no {CERTIFICATE}: copy the folder again, unless `daedalus certs revoke` has removed it"
+        ) from None
 
 
 def _readable_validity(credentials: Credentials | None) -> Validity | None:

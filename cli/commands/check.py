@@ -28,11 +28,11 @@ from daedalus.protocol.texts import short_number
 from daedalus.transport.process_usage import available_processors
 
 _DESCRIPTION = """\
-Makes one environment and plays it with random actions: whether reset and step keep to gymnasium's interface, whether
-observations have the shape and the bounds of their space and a dtype that can be converted to its own, whether all
-numbers are finite, whether episodes end, and how long a step takes. Then prints what `daedalus train` with the same
-options would choose, and builds the network. `daedalus train` itself makes the first steps of this check before it
-starts."""
+Makes one environment, plays it with random actions, and checks whether reset and step keep to gymnasium's interface,
+whether observations have the shape and the bounds of their space and a dtype that can be converted to its own, whether
+all numbers are finite, whether episodes end, and how long a step takes. Then builds the network, and prints what
+`daedalus train` with the same options would choose. `daedalus train` itself makes the first steps of this check before
+it starts."""
 
 _EXAMPLES = """\
 examples:
@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         default=_SECONDS,
         metavar="S",
-        help=f"play for so long, or for {_ENV_STEPS:,} env_steps (default: %(default)g)",
+        help=f"play for this time, or for {_ENV_STEPS:,} env_steps (default: %(default)g)",
     )
     return options
 

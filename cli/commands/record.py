@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 _KEYS, _GAMEPAD = "keys", "gamepad"
 
 _DESCRIPTION = """\
-Plays episodes and records them into a Minari dataset, with the id of the environment: the policy of a run, a bot of
-your own, random actions, or you, with the keyboard or a gamepad. `daedalus train` learns from it with
---demonstrations. An episode is recorded when it ends; after Ctrl-C, or when the window is closed, the dataset has those
-that ended before.
+Plays episodes and records them into a Minari dataset, with the id of the environment. The player is the policy of a
+run, a bot of your own, random actions, or you, with the keyboard or a gamepad. `daedalus train` learns from the dataset
+with --demonstrations. An episode is recorded when it ends; after Ctrl-C, or when the window is closed, the dataset has
+the episodes that ended before.
 
-With --by gamepad, an axis moves a number of the action: at rest the number is that of --idle, to the right, down, or
-pressed it goes up to its highest, to the left or up it goes down to its lowest. Axes: leftx, lefty, rightx, righty,
+With --by gamepad, an axis moves a number of the action. At rest the number is that of --idle. To the right, down, or
+pressed, it goes up to its highest; to the left or up, it goes down to its lowest. Axes: leftx, lefty, rightx, righty,
 lefttrigger, righttrigger. Buttons: a, b, x, y, back, guide, start, leftstick, rightstick, leftshoulder, rightshoulder,
-dpup, dpdown, dpleft, dpright; a direction of a stick is one, too, such as leftx- for left. The program prints what each
-does, and the name of a button when you first press it."""
+dpup, dpdown, dpleft, dpright; a direction of a stick is a button, too, such as leftx- for left. The program prints what
+each does, and the name of a button when you first press it."""
 
 _EXAMPLES = """\
 examples:

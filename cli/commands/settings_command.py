@@ -143,7 +143,7 @@ def _range(kind: Any) -> str:
     bare = _bare(kind)
     if get_origin(bare) is tuple:
         element = _range(get_args(bare)[0])
-        signs += [f"each {element}"] if element else []
+        signs += [f"each {element.removeprefix('each ')}"] if element else []  # of the innermost list
         if Ellipsis not in get_args(bare):
             return ", ".join([f"{len(get_args(bare))} values", *signs])
     least = next((f"{c.min_length} to" for c in found if isinstance(c, MinLen)), "at most")

@@ -38,6 +38,7 @@ def test_every_setting_has_a_meaning() -> None:
         ("environment.crop", "list of int", "4 values, each ≥ 0", "unset"),
         ("environment.action_table", "list of list of float", "2 to 65,536 values", "unset"),
         ("environment.id", "text", "1 to 200 characters", "required"),
+        ("league.sides", "list of list of text", "each at most 64 characters, at most 1,024 values", "`[]`"),
         ("policy.hidden", "list of int", "each ≥ 1, at most 8 values", "`[64, 64]`"),
         ("policy.memory", "`none` `gru`", "", "`none`"),
         ("training.stop_when_solved", "bool", "", "`true`"),
