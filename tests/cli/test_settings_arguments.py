@@ -132,7 +132,7 @@ def test_a_learner_that_resumes_changes_the_settings_that_its_command_line_names
         assert longer.changed == ["training.env_steps"]
     with pytest.raises(SettingsError, match="--reset-statistics needs --resume"):
         chosen("cartpole", "--reset-statistics")
-    with pytest.raises(SettingsError, match="continue the run with `daedalus learner --resume --run-dir .*/run`, or"):
+    with pytest.raises(SettingsError, match=r"continue the run with `daedalus learner --resume --run-dir .*/run`, or"):
         chosen("cartpole", "--run-dir", str(tmp_path / "run"))
     for words, names in (
         (("--seed", "9"), "training.seed"),
