@@ -1,34 +1,25 @@
 """The process of a gateway's camera: plays episodes with the newest policy, and writes what the page shows.
 
-The gateway starts it while somebody watches. It has no network: see gateway/watching/playing_process.py for its
-messages. It runs at the lowest priority. Exit status: 0 the gateway has closed its input or stopped it, 1 failed.
+The gateway starts it while somebody watches. See playing_child.py.
 """
 
 import argparse
 import logging
 import os
-import sys
-import threading
 import time
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
 from daedalus.gateway.watching.playing_process import frame, note
-from daedalus.launch.logs import configure_logging
-from daedalus.launch.playing_child import NICENESS, PlayingInput, reserved_stdout, write_frame
-from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, stop_on_signals
+from daedalus.launch.playing_child import GatewayPipes, run_player
 from daedalus.learner.run.run_directory import run_name
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.codec import ProtocolError
 
 _logger = logging.getLogger("daedalus.launch.camera_process")
 
@@ -73,74 +64,50 @@ _LONGEST_SECONDS = 1.0  # for one frame, for somebody who waits
 _BETWEEN_EPISODES_SECONDS = 0.7
 
 
-class _Output:
+class _Film:
     """Frames to the gateway, at most FRAMES_PER_SECOND; of slower environments at their own speed."""
 
-    def __init__(self, stream: BinaryIO, stop: threading.Event) -> None:
-        self._stream, self._stop, self._due = stream, stop, time.monotonic()
+    def __init__(self, gateway: GatewayPipes) -> None:
+        self._gateway, self._due = gateway, time.monotonic()
 
     def show(self, moment: Moment, version: int) -> None:
         """Write a frame when it is due."""
         facts = {"version": version, "step": moment.step, "reward": moment.reward, "total": moment.total}
         facts |= {"value": moment.value}
-        self._stop.wait(max(self._due - time.monotonic(), 0.0))
+        self._gateway.stop.wait(max(self._due - time.monotonic(), 0.0))
         seconds = min(max(moment.seconds, 1.0 / FRAMES_PER_SECOND), _LONGEST_SECONDS)
         self._due = max(self._due + seconds, time.monotonic())
-        self.write(frame({**facts, "actions": moment.actions}, jpeg(moment.picture)))
-
-    def write(self, data: bytes) -> None:
-        """Write a frame now."""
-        write_frame(self._stream, data)
+        self._gateway.write(frame({**facts, "actions": moment.actions}, jpeg(moment.picture)))
 
 
-def main(output: BinaryIO) -> int:
-    """Play until the gateway closes standard input, and return the exit status."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--allow-module", action="append", default=[])
-    options.add_argument("--checkpoints", type=Path, help="run directory, for value estimates")
-    arguments = options.parse_args()
-    if arguments.checkpoints is not None:  # the environment may change the working directory
-        arguments.checkpoints = Path(os.path.abspath(arguments.checkpoints))
-    configure_logging("warning", as_json=False, process="camera")
-    if hasattr(os, "nice"):  # not on Windows
-        os.nice(NICENESS)
-    stop = stop_on_signals(exit_if_stuck=True)
-    frames = _Output(output, stop)
+def _play(gateway: GatewayPipes, modules: UserModules, arguments: argparse.Namespace) -> int:
+    """Play until the gateway stops this process, and return the exit status."""
     try:
-        modules = UserModules(frozenset(arguments.allow_module), "the run")
-        _film(PlayingInput(sys.stdin.fileno(), stop), frames, modules, arguments.checkpoints, stop)
-    except EOFError:
-        return 0
+        _film(gateway, modules, arguments.checkpoints)
     except ImportError:
-        frames.write(note('The camera needs Pillow: pip install "daedalus-rl[gateway]" on the host of the gateway.'))
+        gateway.write(note('The camera needs Pillow: pip install "daedalus-rl[gateway]" on the host of the gateway.'))
         return 1
-    except (EnvironmentSetupError, PolicyError, ProtocolError) as error:
-        if not stop.is_set():
-            frames.write(note(f"The camera cannot play: {error}"))
-        return 1
-    except Exception as error:  # of an environment's own renderer, such as OpenGL without a driver
-        frames.write(note(f"The camera cannot play: {type(error).__name__}: {first_line(error)}"))
-        raise
     return 0
 
 
-def _film(
-    given: PlayingInput, frames: _Output, modules: UserModules, checkpoints: Path | None, stop: threading.Event
-) -> None:
-    welcome, program = given.begin()
+def _film(gateway: GatewayPipes, modules: UserModules, checkpoints: Path | None) -> None:
+    # The environment may change the working directory.
+    checkpoints = None if checkpoints is None else Path(os.path.abspath(checkpoints))
+    welcome, program = gateway.begin()
+    film, stop = _Film(gateway), gateway.stop
     runtime = OnnxRuntime(program.model.tobytes(), stop)
     is_its_directory = checkpoints is not None and run_name(checkpoints) == welcome.run
     values = CheckpointValues(checkpoints, modules) if checkpoints is not None and is_its_directory else None
     camera = EpisodeCamera(welcome.spec, modules) if values is None else EpisodeCamera(welcome.spec, modules, values)
     try:
         while not stop.is_set():
-            snapshot = given.newest
+            snapshot = gateway.newest
             assert snapshot is not None
             runtime.load(snapshot.weights)
             if values is not None:
                 values.refresh()
             for moment in camera.play(runtime):
-                frames.show(moment, snapshot.policy_version)
+                film.show(moment, snapshot.policy_version)
                 if stop.is_set():
                     return
             stop.wait(_BETWEEN_EPISODES_SECONDS)
@@ -149,5 +116,6 @@ def _film(
 
 
 if __name__ == "__main__":
-    exit_on_thread_exceptions(plays=True)
-    sys.exit(exit_status(lambda: main(reserved_stdout())))
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--checkpoints", type=Path, help="run directory, for value estimates")
+    run_player("camera", "The camera cannot play", _play, options)

@@ -1,31 +1,22 @@
 """The process of a match on the gateway's page: one person plays against the policy that the gateway sends.
 
-It has no network: see gateway/watching/playing_process.py for its messages, and gateway/watching/person_matches.py for
-the orders. It runs at the lowest priority. Exit status: 0 the gateway has closed its input or stopped it, 1 failed.
+See playing_child.py, and gateway/watching/person_matches.py for the orders.
 """
 
 import argparse
 import logging
-import os
 import queue
-import sys
 import threading
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import jpeg
 from daedalus.actor.evaluation.person_match import PersonMatch, Turn, board_of, choices_of, result_of
 from daedalus.gateway.watching.playing_process import frame, note
-from daedalus.launch.logs import configure_logging
-from daedalus.launch.playing_child import NICENESS, PlayingInput, reserved_stdout, write_frame
-from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_status, stop_on_signals
-from daedalus.policy.acting.program_check import PolicyError
+from daedalus.launch.playing_child import GatewayPipes, run_player
 from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import Program, Welcome
 from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
 
@@ -50,11 +41,11 @@ class _Table:
         """Close the game."""
         self._match.close()
 
-    def obey(self, order: dict[str, Any], given: PlayingInput) -> bytes:
+    def obey(self, order: dict[str, Any], gateway: GatewayPipes) -> bytes:
         """Perform an order, and return what the page shows then."""
         remark = ""
         if order["type"] == "BeginMatch":
-            snapshot = given.newest
+            snapshot = gateway.newest
             assert snapshot is not None
             self._runtime.load(snapshot.weights)
             self._version = snapshot.policy_version
@@ -104,48 +95,21 @@ def _jpeg(picture: np.ndarray) -> bytes:
         return b""
 
 
-def main(output: BinaryIO) -> int:
-    """Play until the gateway closes standard input, and return the exit status."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--allow-module", action="append", default=[])
-    arguments = options.parse_args()
-    configure_logging("warning", as_json=False, process="match")
-    if hasattr(os, "nice"):  # not on Windows
-        os.nice(NICENESS)
-    stop = stop_on_signals(exit_if_stuck=True)
+def _play(gateway: GatewayPipes, modules: UserModules, _arguments: argparse.Namespace) -> int:
+    """Play until the gateway stops this process, and return the exit status."""
+    welcome, program = gateway.begin()
+    table = _Table(welcome, program, modules, gateway.stop)
     try:
-        _play(
-            PlayingInput(sys.stdin.fileno(), stop),
-            output,
-            UserModules(frozenset(arguments.allow_module), "the run"),
-            stop,
-        )
-    except EOFError:
-        return 0
-    except (EnvironmentSetupError, PolicyError, ProtocolError) as error:
-        if not stop.is_set():
-            write_frame(output, note(f"The match cannot be played: {error}"))
-        return 1
-    except Exception as error:  # of an environment's own renderer
-        write_frame(output, note(f"The match cannot be played: {type(error).__name__}: {first_line(error)}"))
-        raise
+        while not gateway.stop.is_set():
+            try:
+                order = gateway.orders.get(timeout=_POLL_SECONDS)
+            except queue.Empty:
+                continue
+            gateway.write(table.obey(order, gateway))
+    finally:
+        table.close()
     return 0
 
 
-def _play(given: PlayingInput, output: BinaryIO, modules: UserModules, stop: threading.Event) -> None:
-    welcome, program = given.begin()
-    table = _Table(welcome, program, modules, stop)
-    try:
-        while not stop.is_set():
-            try:
-                order = given.orders.get(timeout=_POLL_SECONDS)
-            except queue.Empty:
-                continue
-            write_frame(output, table.obey(order, given))
-    finally:
-        table.close()
-
-
 if __name__ == "__main__":
-    exit_on_thread_exceptions(plays=True)
-    sys.exit(exit_status(lambda: main(reserved_stdout())))
+    run_player("match", "The match cannot be played", _play, argparse.ArgumentParser(description=__doc__))

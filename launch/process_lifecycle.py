@@ -238,6 +238,17 @@ def open_standard_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def reserved_stdout() -> TextIO:
+    """Return standard output for its caller alone: whatever else this process prints goes to standard error.
+
+    This includes libraries that are not Python's, and the processes of environments.
+    """
+    reserved = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
+    sys.stdout.flush()
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return reserved
+
+
 def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     """Run a command and return its exit status; 141 if nobody reads its output any more, as in `daedalus ... | head`.
 

@@ -12,13 +12,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.logs import configure_logging, say
-from daedalus.launch.process_lifecycle import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.launch.process_lifecycle import (
+    exit_on_thread_exceptions,
+    exit_with_parent,
+    reserved_stdout,
+    stop_on_signals,
+)
 from daedalus.launch.supervision import start
 from daedalus.learner.reporting.trackers.tracker import is_installed, tracker_class, tracker_name
 from daedalus.learner.reporting.trackers.tracking import Tracking
@@ -39,7 +45,9 @@ def main() -> int:
     options.add_argument("--exit-with-parent", action="store_true")
     parsed = options.parse_args()
     process, context = "tracker" if parsed.service else "", {"run": run_name(parsed.directory)}
-    configure_logging(as_json=parsed.log_json, process=process, context=context, write=_own_output())
+    configure_logging(
+        as_json=parsed.log_json, process=process, context=context, write=partial(say, stream=reserved_stdout())
+    )
     finish = stop_on_signals()
     exit_with_parent(finish)
     threading.Thread(target=_end_in_time, args=(finish,), name="end", daemon=True).start()
@@ -51,14 +59,6 @@ def main() -> int:
         return 1
     done = Tracking(parsed.name, parsed.directory, open_tracker, finish).run()
     os._exit(0 if done else 1)  # packages of trackers wait for the network at the end of the interpreter
-
-
-def _own_output() -> Callable[[str], None]:
-    """Return a function that prints a line on standard output. What packages print goes to standard error."""
-    own = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
-    sys.stdout.flush()
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return lambda line: say(line, own)
 
 
 def _end_in_time(finish: threading.Event) -> None:

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import sys
 import threading
 from collections.abc import Sequence
@@ -24,6 +23,7 @@ from daedalus.launch.process_lifecycle import (
     exit_on_thread_exceptions,
     exit_status,
     open_standard_streams,
+    reserved_stdout,
     stop_on_signals,
 )
 from daedalus.policy.acting.program_check import PolicyError
@@ -282,16 +282,6 @@ def _record(result: dict[str, Any], directory: Path) -> bool:
     return True
 
 
-def _reserved_stdout() -> TextIO:
-    """Return standard output for the result alone: whatever else this process prints goes to standard error.
-
-    This includes libraries that are not Python's, and the processes of environments.
-    """
-    result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return result
-
-
 def _text(result: dict[str, Any]) -> str:
     scores: MatchScores | None = result.get("matches")
     best = "best checkpoint, " if result["best_checkpoint"] else ""
@@ -344,7 +334,7 @@ def run_process() -> NoReturn:
     """Run the command of this process, and end it."""
     exit_on_thread_exceptions(plays=True)
     open_standard_streams()  # before descriptors are opened
-    stopped, result = stop_on_signals(exit_if_stuck=True), _reserved_stdout()
+    stopped, result = stop_on_signals(exit_if_stuck=True), reserved_stdout()
     sys.exit(exit_status(lambda: main(stop=stopped, output=result), result))
 
 
