@@ -21,7 +21,7 @@ from daedalus.analysis.statistics import (
     probability_of_improvement,
 )
 from daedalus.learner.run.settings import value_text
-from daedalus.protocol.texts import exact_number, one_line, printable, short_number
+from daedalus.protocol.texts import aligned, exact_number, one_line, printable, short_number
 
 
 class Estimate(NamedTuple):
@@ -178,13 +178,9 @@ def _heading(comparison: Comparison) -> str:
 
 
 def _table(comparison: Comparison) -> str:
-    head = header(comparison)
-    rows = [cells(result, comparison) for result in comparison.results]
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in [head, *rows]
-    ]
-    lines.insert(1, "  ".join("-" * width for width in widths))
+    rows = [header(comparison), *(cells(result, comparison) for result in comparison.results)]
+    lines = aligned(rows)
+    lines.insert(1, "  ".join("-" * max(map(len, column)) for column in zip(*rows, strict=True)))
     return "\n".join(printable(line) for line in [*lines, "", *notes(comparison)])
 
 

@@ -43,7 +43,7 @@ def configure_logging(
     as_json: bool = False,
     process: str = "",
     context: Mapping[str, str] | None = None,
-    prefix: str = "",
+    command: str = "",
     write: Callable[[str], None] | None = None,
 ) -> None:
     """Send the records of all daedalus loggers to the terminal.
@@ -54,19 +54,20 @@ def configure_logging(
       process: kind of this process, such as `learner`: each line has its time and severity, the process and the fields
         of `context`; in short if standard output is a terminal. Empty: each line has the message alone, for a person.
       context: fields of each record, such as `run` and `epoch`; read for each record, so the caller may change it.
-      prefix: text before each message without `process`.
-      write: called with each line, if a progress line shares the terminal (default: print to standard output).
+      command: name of a command whose standard output is its result: lines go to standard error, after
+        `daedalus COMMAND: ` unless they have the form of a service or of JSON.
+      write: called with each line, if a progress line shares the terminal (default: print it).
     """
     context = {} if context is None else context
     if as_json:
         formatter: logging.Formatter = _JsonFormatter(context)
     elif not process:
-        formatter = _MessageFormatter(prefix)
+        formatter = _MessageFormatter(f"daedalus {command}: " if command else "")
     elif sys.stdout.isatty():
         formatter = _TerminalFormatter(process, context)
     else:
         formatter = _ServiceFormatter(process, context)
-    handler = LineHandler(write or say)
+    handler = LineHandler(write or (lambda line: say(line, sys.stderr if command else None)))
     handler.setFormatter(formatter)
     if not (process or as_json or level == "debug"):
         handler.addFilter(_needs_attention)

@@ -9,6 +9,7 @@ through one of these functions.
 
 import os
 import re
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from urllib.parse import quote, unquote, urlsplit
@@ -117,6 +118,18 @@ def bounded_text(text: str, most: int = MAX_TEXT) -> str:
     start = without_secrets(text[: 4 * most])[:most]
     printable = "".join(character if character.isprintable() else " " for character in start)
     return " ".join(printable.split()).encode()[:most].decode(errors="ignore")
+
+
+def aligned(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:
+    """Return the rows of a table as lines. `right` are the columns of numbers, counted from 0, which end flush."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.rjust(width) if at in right else cell.ljust(width)
+            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
 
 
 def short_number(value: float) -> str:

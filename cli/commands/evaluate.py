@@ -33,7 +33,7 @@ from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError
 from daedalus.protocol.spec import Backend
-from daedalus.protocol.texts import bounded_text, short_number
+from daedalus.protocol.texts import aligned, bounded_text, short_number
 
 _FAILURES = (
     EvaluationStoppedError,
@@ -190,12 +190,7 @@ def main(
     words = sys.argv[1:] if command_line is None else command_line
     with redirect_stdout(output):  # for --help
         arguments = parser().parse_args(words)
-    configure_logging(
-        arguments.log_level,
-        as_json=arguments.log_json,
-        prefix="daedalus evaluate: ",
-        write=lambda line: say(line, sys.stderr),
-    )
+    configure_logging(arguments.log_level, as_json=arguments.log_json, command="evaluate")
     stop = stop or threading.Event()
     try:
         options = evaluation_options(arguments)
@@ -317,11 +312,10 @@ def _lines_of(scores: MatchScores, result: dict[str, Any], best: str) -> list[st
         )
         for score in (*scores.sides, scores.total)
     ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         f"{result['environment']}, {best}policy version {result['policy_version']}, against {scores.opponent}"
         f"{version}: {scores.total.games} {result['actions']} games{openings}, seed {result['seed']}",
-        *("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows),
+        *aligned(rows),
         f"in brackets: Wilson's interval at 95 %; distinct games: {scores.distinct_games}",
     ]
 

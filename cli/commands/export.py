@@ -85,12 +85,7 @@ def parser() -> argparse.ArgumentParser:
 def export(arguments: list[str]) -> int:
     """Run `daedalus export` and return its exit status: 0 done, 1 failed, 2 bad usage."""
     parsed = parser().parse_args(arguments)
-    configure_logging(
-        parsed.log_level,
-        as_json=parsed.log_json,
-        prefix="daedalus export: ",
-        write=lambda line: say(line, sys.stderr),
-    )
+    configure_logging(parsed.log_level, as_json=parsed.log_json, command="export")
     if sum(each is not None for each in (parsed.directory, parsed.pretrained, parsed.from_hub)) != 1:
         print_error("export", "name either a run directory, or --pretrained or --from-hub, and then the file to write")
         return 2

@@ -1,7 +1,6 @@
 """`daedalus push`: upload the policy of a run to the Hugging Face Hub."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import add_logging, command_parser
@@ -45,12 +44,7 @@ def push(arguments: list[str]) -> int:
     from daedalus.analysis.hub_upload import push as upload
 
     parsed = parser().parse_args(arguments)
-    configure_logging(
-        parsed.log_level,
-        as_json=parsed.log_json,
-        prefix="daedalus push: ",
-        write=lambda line: say(line, sys.stderr),
-    )
+    configure_logging(parsed.log_level, as_json=parsed.log_json, command="push")
     try:
         address = upload(parsed.directory, parsed.repository, private=parsed.private)
     except RepositoryNameError as error:

@@ -109,12 +109,7 @@ def parser() -> argparse.ArgumentParser:
 def record(arguments: list[str]) -> int:
     """Run `daedalus record` and return its exit status."""
     parsed = parser().parse_args(arguments)
-    configure_logging(
-        parsed.log_level,
-        as_json=parsed.log_json,
-        prefix="daedalus record: ",
-        write=lambda line: say(line, sys.stderr),
-    )
+    configure_logging(parsed.log_level, as_json=parsed.log_json, command="record")
     try:
         keys, idle, axes = *_actions(parsed), _axes(parsed.axis)
     except ValueError as error:

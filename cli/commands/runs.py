@@ -4,7 +4,6 @@ import argparse
 import json
 import shlex
 import signal
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +11,7 @@ from daedalus.cli.arguments import command_parser, whole_number
 from daedalus.launch.logs import print_error, say
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.settings import SettingsError
+from daedalus.protocol.texts import aligned, one_line
 
 if TYPE_CHECKING:
     from daedalus.analysis.run_archive import RunArchive
@@ -159,20 +159,12 @@ def _list(parsed: argparse.Namespace) -> int:
                 " ".join(entry.labels.tags),
             )
         )
-    _say_table(rows)
+    for line in aligned([[one_line(cell) for cell in row] for row in rows]):
+        say(line)
     for entry in entries:
         if entry.problem:
             print_error("runs", entry.problem)
     return 0
-
-
-def _say_table(rows: Sequence[Sequence[str]]) -> None:
-    from daedalus.protocol.texts import one_line
-
-    rows = [[one_line(cell) for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _mib(size: int) -> str:

@@ -24,6 +24,7 @@ from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.league import NEWEST, LeagueStatus
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import (
+    aligned,
     one_line,
     policy_lag,
     printable,
@@ -334,20 +335,8 @@ def _league_table(league: LeagueStatus) -> list[str]:
         numbers = f"{round(each.rating):,}", f"{round(each.deviation):,}", f"{each.matches:,}"
         rows.append([one_line(each.player)[:_LONGEST_PLAYER], *numbers, wins])
     more = len(by_rating) - len(first) + league.left_out
-    return [*_aligned(rows, {0}), *([f"  ... and {more:,} more players"] if more else [])]
-
-
-def _aligned(rows: Sequence[Sequence[str]], left: Collection[int]) -> list[str]:
-    """Return the lines of a table. `left` are the columns of words, which are aligned to the left."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        cells = [
-            text.ljust(width) if at in left else text.rjust(width)
-            for at, (text, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append(f"  {'  '.join(cells)}")
-    return lines
+    lines = [f"  {line}" for line in aligned(rows, range(1, len(rows[0])))]
+    return [*lines, *([f"  ... and {more:,} more players"] if more else [])]
 
 
 _Cell = Callable[[ActorStatus, RunStatus], str]
@@ -373,7 +362,6 @@ _COLUMNS: dict[str, _Cell] = {
     "MB/h up": lambda actor, _: f"{actor.bytes_up_per_hour / 1e6:,.0f}",
     "down": lambda actor, _: f"{actor.bytes_down_per_hour / 1e6:,.0f}{'c' if actor.compact_snapshots else ''}",
 }
-_LEFT = ("actor", "state")  # columns of words
 _LEAST_IMPORTANT = (
     *("down", "MB/h up", "cpu", "MB", "accepted", "envs", "lives", "epsilon", "env_steps", "missed", "busy", "waits"),
 )
@@ -402,8 +390,9 @@ def _actor_table(status: RunStatus) -> list[str]:
             break
         dropped += [name] if columns.pop(name, None) else []
     rows = list(zip(*((name, *cells) for name, cells in columns.items()), strict=True))
-    left = [index for index, name in enumerate(columns) if name in _LEFT]
-    return [*_aligned(rows, left), *([f"  --json has more columns: {', '.join(dropped)}"] if dropped else [])]
+    right = [index for index, name in enumerate(columns) if name not in ("actor", "state")]
+    lines = [f"  {line}" for line in aligned(rows, right)]
+    return [*lines, *([f"  --json has more columns: {', '.join(dropped)}"] if dropped else [])]
 
 
 def _measured(seconds: float) -> str:
