@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
+from daedalus.actor.collecting.client_rows import ClientRows, check_run
 from daedalus.actor.collecting.client_seats import MatchSeat, seated_space
 from daedalus.actor.collecting.loop_recorder import EpisodeTape
 from daedalus.actor.collecting.rollout_writer import RowInputs
@@ -151,14 +151,14 @@ class ClientActor:
         assert self._transforms is not None
         assert self._session is not None
         try:
-            rows = make_client_rows(
+            rows = ClientRows(
                 current.session.spec,
                 self._transforms,
                 current.runtime,
                 np.random.default_rng((self._session.entropy(self.name), 0)),
-                epsilon=self._session.epsilon,
-                example_mask=self.spaces.example_mask,
                 on_full=self._keep,
+                has_masks=self.spaces.example_mask is not None,
+                epsilon=self._session.epsilon,
                 seat=self._seat,
             )
         except PolicyError as error:

@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
+from daedalus.actor.collecting.client_rows import ClientRows, check_run
 from daedalus.actor.collecting.client_seats import MatchSeat, match_seats, seated_space
 from daedalus.actor.collecting.loop_recorder import EpisodeTape
 from daedalus.actor.collecting.policy_guard import PolicyGuard
@@ -466,14 +466,14 @@ class ClientCollector:
             agent.keep(full)
             self.on_rollout()
 
-        return make_client_rows(
+        return ClientRows(
             spec,
             self._transforms,
             self._program,
             np.random.default_rng(seed),
-            epsilon=epsilon,
-            example_mask=self._example_mask,
             on_full=keep,
+            has_masks=self._example_mask is not None,
+            epsilon=epsilon,
             seat=agent.seat,
         )
 

@@ -36,42 +36,47 @@ class ClientRows:
 
     def __init__(
         self,
+        spec: ActorSpec,
         transforms: Transforms,
-        writer: RolloutWriter,
+        runtime: PolicyRuntime,
+        random: np.random.Generator,
         *,
-        example_mask: Any,
-        bootstrap_terminations: bool,
         on_full: Callable[["ClientRows"], None],
+        has_masks: bool = False,
+        epsilon: float = 0.0,
         seat: MatchSeat | None = None,
-        agent_ids: bool = False,
-        learns_overrides: bool = False,
-        draws: LessonDraws | None = None,
     ) -> None:
-        """Construct the rows.
+        """Construct the rows. Raises PolicyError if the program cannot explore as it must.
 
         Args:
+          spec: of the run.
           transforms: of the loop's spaces to the run's.
-          writer: of one environment. It has not started.
-          example_mask: a mask, or a map of masks by action component, if the loop has masks; else None.
-          bootstrap_terminations: whether a terminated episode needs its last observation.
+          runtime: the policy.
+          random: draws the noise of the policy.
           on_full: called when the rollout is full: it must call `finished_copy`.
+          has_masks: whether the loop has masks.
+          epsilon: final probability of a random action.
           seat: of a match whose seats the loop hosts; None: of none.
-          agent_ids: whether the policy observes the number of the seat.
-          learns_overrides: whether the learner learns from the actions that are played in place of the policy's.
-          draws: of the parameters of the loop's environment; None: the run has none.
         """
-        self.draws = draws
+        self._spec, self._transforms, self._has_masks, self._on_full = spec, transforms, has_masks, on_full
+        self._writer = RolloutWriter(
+            transforms.spaces,
+            1,
+            runtime,
+            spec.environment,
+            rollout_length=spec.collection.rollout_length,
+            random=random,
+            epsilon=epsilon,
+        )
+        self.draws = LessonDraws(spec, random) if spec.environment.parameters else None
         self._drawn: Parameters | None = None  # of the next episode, if somebody has asked for them
         self._playing: Parameters = {}  # of the episode of the last action
-        self.seat, self._is_numbered = seat, agent_ids and seat is not None
-        self._transforms, self._writer, self._has_masks = transforms, writer, example_mask is not None
-        self._bootstrap_terminations = bootstrap_terminations
-        self._on_full = on_full
+        self.seat = seat
         self._last: Observed | None = None  # the newest observation
         self._acted = False  # the current row has an action and no outcome yet
         self._idle = False  # the row that has begun is not written
         self._overridden = False  # another action than the policy's is played in it
-        self._learns_overrides, self._warned = learns_overrides, False
+        self._warned = False
         self._played: dict[str, np.ndarray] | None = None  # that action, if the learner learns from it
         self._ending = False  # the episode ends with the current row, which late rewards may still change
         self._episode_ended = False  # the next row is a reset row
@@ -169,7 +174,7 @@ class ClientRows:
     def _to_learn_from(self, override: Any) -> dict[str, np.ndarray] | None:
         """Return the action that is played as the policy would have chosen it; None if it could not, or nobody learns
         from it."""
-        if override is None or not self._learns_overrides:
+        if override is None or not self._spec.algorithm.learns_overrides:
             return None
         try:
             return self._transforms.policy_action(override)
@@ -230,7 +235,7 @@ class ClientRows:
             last = self._observed(observation, self._open_masks(), needed=False)
         elif not terminated:
             raise ValueError("a truncated episode needs its last observation for the bootstrap value: pass it")
-        elif self._bootstrap_terminations:
+        elif self._spec.environment.bootstrap_terminations:
             raise ValueError(
                 "this run bootstraps terminated episodes too (environment.bootstrap_terminations): "
                 "pass the last observation"
@@ -246,7 +251,7 @@ class ClientRows:
             self.seat.steps.end()
 
     def _observed(self, observation: Any, action_mask: Any, *, needed: bool) -> Observed:
-        if self._is_numbered and self.seat is not None:
+        if self._spec.environment.agent_ids and self.seat is not None:
             observation = numbered(observation, self.seat.number)
         return self._transforms.observe_one(observation, action_mask, needed=needed)
 
@@ -329,46 +334,3 @@ def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
             f"this run sets {' and '.join(changed)}, which a client does not apply: its own loop wraps its "
             "environment, repeats actions and ends episodes; start the run without these settings"
         )
-
-
-def make_client_rows(
-    spec: ActorSpec,
-    transforms: Transforms,
-    runtime: PolicyRuntime,
-    random: np.random.Generator,
-    *,
-    epsilon: float,
-    example_mask: Any,
-    on_full: Callable[[ClientRows], None],
-    seat: MatchSeat | None = None,
-) -> ClientRows:
-    """Return the rows of one loop under one learner. Raises PolicyError if the program cannot explore as it must.
-
-    Args:
-      spec: of the run.
-      transforms: of the loop's spaces to the run's.
-      runtime: the policy.
-      random: draws the noise of the policy.
-      epsilon: final probability of a random action.
-      example_mask, on_full, seat: see ClientRows.
-    """
-    writer = RolloutWriter(
-        transforms.spaces,
-        1,
-        runtime,
-        spec.environment,
-        rollout_length=spec.collection.rollout_length,
-        random=random,
-        epsilon=epsilon,
-    )
-    return ClientRows(
-        transforms,
-        writer,
-        example_mask=example_mask,
-        bootstrap_terminations=spec.environment.bootstrap_terminations,
-        on_full=on_full,
-        seat=seat,
-        agent_ids=spec.environment.agent_ids,
-        learns_overrides=spec.algorithm.learns_overrides,
-        draws=LessonDraws(spec, random) if spec.environment.parameters else None,
-    )

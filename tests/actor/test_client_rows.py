@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from oracles import stack_rows
 
 from daedalus.actor.collecting.client_rows import ClientRows
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.learner.serving.rollout_judge import episode_violation
 from daedalus.policy.acting.program import export_program
@@ -31,21 +30,22 @@ RUNTIME = OnnxRuntime(export_program(NETWORK, TRANSFORMS.spaces))
 RUNTIME.load({name: parameter.detach().numpy() for name, parameter in NETWORK.named_parameters()})
 
 
+def rows_of(transforms: Transforms, runtime: OnnxRuntime, rollouts: list[Rollout], **more: Any) -> ClientRows:
+    """Return rows whose full rollouts are added to a list."""
+
+    def keep(rows: ClientRows) -> None:
+        rollouts.append(rows.finished_copy(0))
+
+    random = np.random.default_rng(1)
+    return ClientRows(SPEC.for_actors(), transforms, runtime, random, on_full=keep, **more)
+
+
 class Loop:
     """A loop whose observations are [episode, step], and each of whose rewards says where it belongs."""
 
     def __init__(self) -> None:
-        writer = RolloutWriter(
-            TRANSFORMS.spaces, 1, RUNTIME, SPEC.environment, rollout_length=ROWS, random=np.random.default_rng(1)
-        )
-        arguments: dict[str, Any] = {"example_mask": None, "bootstrap_terminations": False}
         self.rollouts: list[Rollout] = []
-        self.rows = ClientRows(
-            TRANSFORMS,
-            writer,
-            on_full=lambda rows: self.rollouts.append(rows.finished_copy(0)),
-            **arguments,
-        )
+        self.rows = rows_of(TRANSFORMS, RUNTIME, self.rollouts)
         self.episode, self.step = 1, 0
 
     def observe(self) -> None:
@@ -144,17 +144,8 @@ def test_last_observation_of_an_episode_allows_every_choice() -> None:
     network = ActorCritic(PolicySpec(hidden=(8,)), transforms.spaces)
     runtime = OnnxRuntime(export_program(network, transforms.spaces))
     runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
-    writer = RolloutWriter(
-        transforms.spaces, 1, runtime, SPEC.environment, rollout_length=ROWS, random=np.random.default_rng(1)
-    )
     rollouts: list[Rollout] = []
-    rows = ClientRows(
-        transforms,
-        writer,
-        example_mask=[True, False, False],
-        bootstrap_terminations=False,
-        on_full=lambda rows: rollouts.append(rows.finished_copy(0)),
-    )
+    rows = rows_of(transforms, runtime, rollouts, has_masks=True)
     for _ in range(ROWS):
         rows.observe(np.zeros(2, np.float32), [False, True, True])
         while rows.choose() is None:
