@@ -16,14 +16,14 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.episodes import EvaluationProgress, environments_for
-from daedalus.actor.evaluation.matches import MatchResults, play_matches, wilson_interval
+from daedalus.actor.evaluation.matches import MatchResults, play_matches
 from daedalus.launch.evaluation_options import EvaluationOptions, actions_of, check_spaces, environment_of, modules_of
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import evaluation_result
 from daedalus.policy.saving.hub import HubError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy
 from daedalus.policy.user_code import Surroundings
-from daedalus.protocol.league import is_bot
+from daedalus.protocol.league import is_bot, wilson_interval
 
 _MOST_LISTED = 20
 _FEW = 0.5  # share of the games that must differ from all others, unless a note says that they do not
@@ -186,9 +186,9 @@ def _score(results: MatchResults, chosen: np.ndarray, agents: tuple[str, ...]) -
         wins=wins,
         draws=draws,
         losses=losses,
-        win_interval=wilson_interval(wins, games),
-        draw_interval=wilson_interval(draws, games),
-        loss_interval=wilson_interval(losses, games),
+        win_interval=wilson_interval(wins / games, games),
+        draw_interval=wilson_interval(draws / games, games),
+        loss_interval=wilson_interval(losses / games, games),
         return_mean=own,
         opponent_return_mean=opponents,
     )

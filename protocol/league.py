@@ -19,6 +19,7 @@ MAX_PLAYER = 200  # characters
 MAX_SIDES = 1024
 _MAX_PLAYERS = 512
 _MAX_COUNTS = 4096
+_Z = 1.959963984540054  # of a normal distribution, 95 % of which lies between -z and z
 
 PlayerName = Annotated[str, Field(min_length=1, max_length=MAX_PLAYER)]
 Weight = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
@@ -39,6 +40,19 @@ def version_of(player: str) -> int | None:
 def is_bot(player: str) -> bool:
     """Return whether a fixed opponent is code: the others are policies of other runs."""
     return player == RANDOM or ":" in player
+
+
+def wilson_interval(share: float, matches: float) -> tuple[float, float]:
+    """Return the 95 % interval of the probability of an outcome that `share` of `matches` had; 0 to 1 without matches.
+
+    Wilson, E. B. (1927). Probable inference, the law of succession, and statistical inference. Equation 8.
+    """
+    if matches <= 0.0:
+        return 0.0, 1.0
+    square = _Z**2
+    centre = (share + square / (2 * matches)) / (1 + square / matches)
+    half = _Z / (1 + square / matches) * math.sqrt(share * (1 - share) / matches + square / (4 * matches**2))
+    return (centre - half if share > 0.0 else 0.0), (centre + half if share < 1.0 else 1.0)
 
 
 class MatchCount(Specification):

@@ -1,7 +1,6 @@
 """Matches of a policy against an opponent, from every side of a game in turn, and their results. No network."""
 
 import hashlib
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -23,8 +22,6 @@ from daedalus.actor.evaluation.episodes import (
 )
 from daedalus.policy.acting.runtime import PolicyRuntime
 
-_Z = 1.959963984540054  # of a normal distribution, 95 % of which lies between -z and z
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatchResults:
@@ -36,17 +33,6 @@ class MatchResults:
     lengths: np.ndarray  # [matches] int32, env_steps
     cut: np.ndarray  # [matches] bool, whether the match was cut: its result is that of the returns until then
     distinct: int  # number of matches that differ in what was observed
-
-
-def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Return the interval of a probability, at 95 %, of which `count` of `total` independent trials are the sample.
-
-    Wilson, E. B. (1927). Probable inference, the law of succession, and statistical inference. Equation 8.
-    """
-    share, square = count / total, _Z**2
-    centre = (share + square / (2 * total)) / (1 + square / total)
-    half = _Z / (1 + square / total) * math.sqrt(share * (1 - share) / total + square / (4 * total**2))
-    return (centre - half if count else 0.0), (centre + half if count < total else 1.0)
 
 
 def play_matches(

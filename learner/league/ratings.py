@@ -9,7 +9,6 @@ import math
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 from daedalus.learner.run.settings import SettingsError
@@ -24,6 +23,7 @@ from daedalus.protocol.league import (
     Score,
     version_name,
     version_of,
+    wilson_interval,
 )
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spec import LeagueSpec
@@ -43,7 +43,6 @@ _MOST_UPDATES = 400  # of ratings, by the results in one rollout: it takes 10 ms
 _MOST_RETIRED = 512  # players that are gone, whose matches may still end
 _RATING_PAIRS = 16  # beside the newest policy against each fixed opponent
 _CONFIDENT = 100.0  # recent matches, from which a win rate counts as measured
-_Z = NormalDist().inv_cdf(0.975)
 
 
 def _order(player: str) -> tuple[int, int, str]:
@@ -91,20 +90,6 @@ class _Results:
         self.wins = kept * self.wins + weight * wins
         self.draws = kept * self.draws + weight * draws
         self.losses = kept * self.losses + weight * losses
-
-
-def lower_bound(share: float, matches: float) -> float:
-    """Return the lower end of the 95 % interval of a win rate (Wilson, 1927); 0 without matches.
-
-    Args:
-      share: wins, and half of the draws, in all matches.
-      matches: number of matches.
-    """
-    if matches <= 0.0:
-        return 0.0
-    centre = share + _Z * _Z / (2.0 * matches)
-    error = _Z * math.sqrt(share * (1.0 - share) / matches + _Z * _Z / (4.0 * matches * matches))
-    return max((centre - error) / (1.0 + _Z * _Z / matches), 0.0)
 
 
 class Ratings:
@@ -248,7 +233,8 @@ class Ratings:
         if target.target_opponent is not None:
             results = self._results_of(NEWEST, target.target_opponent)
             share = (results.wins + results.draws / 2.0) / max(results.matches, 1.0)
-            return results.matches >= _CONFIDENT and lower_bound(share, results.matches) >= target.target_win_rate
+            surely, _ = wilson_interval(share, results.matches)
+            return results.matches >= _CONFIDENT and surely >= target.target_win_rate
         newest = self._skills[NEWEST]
         surely = newest.rating - 2.0 * newest.deviation
         return target.target_rating is not None and newest.matches >= _CONFIDENT and surely >= target.target_rating

@@ -11,11 +11,12 @@ from plain import PlainPolicy
 
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.transforms import TransformedEnvironment
-from daedalus.actor.evaluation.matches import MatchResults, play_matches, wilson_interval
+from daedalus.actor.evaluation.matches import MatchResults, play_matches
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.league import wilson_interval
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
 
 MODULES = UserModules(frozenset({"scripted_games"}))
@@ -140,11 +141,17 @@ def test_long_games_are_cut() -> None:
     assert results.distinct == 2
 
 
-@pytest.mark.parametrize(("count", "total"), [(0, 100), (3, 10), (50, 100), (100, 100)])
-def test_the_interval_ends_where_the_sample_is_two_deviations_away(count: int, total: int) -> None:
-    low, high = wilson_interval(count, total)
+@pytest.mark.parametrize(("count", "total"), [(0, 100), (3, 10), (50, 100), (100, 100), (0.5, 2.5)])
+def test_the_interval_ends_where_the_sample_is_two_deviations_away(count: float, total: float) -> None:
+    low, high = wilson_interval(count / total, total)
     for bound in (low, high):
         deviation = np.sqrt(bound * (1 - bound) / total)
         assert bound in (0.0, 1.0) or abs(count / total - bound) == pytest.approx(1.959964 * deviation)
     assert low <= count / total <= high
     assert (low == 0.0, high == 1.0) == (count == 0, count == total)
+
+
+def test_the_interval_is_that_of_newcombe() -> None:
+    """Newcombe (1998), table I, method 3."""
+    assert wilson_interval(81 / 263, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert wilson_interval(0.0, 0.0) == (0.0, 1.0)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daedalus.learner.league.ratings import LeagueState, Ratings, lower_bound
+from daedalus.learner.league.ratings import LeagueState, Ratings
 from daedalus.learner.league.versions import KeptVersion, thinned
 from daedalus.protocol.league import NEWEST, MatchCount, Purpose, RatedPlayer
 from daedalus.protocol.spec import LeagueSpec
@@ -152,12 +152,6 @@ def test_a_rating_is_reached_two_deviations_above_it() -> None:
     rating = of(ratings, NEWEST).rating
     assert ratings.reach(LeagueSpec(target_rating=rating - 101.0))
     assert not ratings.reach(LeagueSpec(target_rating=rating - 99.0))
-
-
-def test_lower_bound_by_hand() -> None:
-    """Wilson's interval: 81 of 100 has 0.7222 to 0.8749 (Newcombe, 1998, has 81 of 263: 0.2553)."""
-    assert lower_bound(81 / 263, 263) == pytest.approx(0.2553, abs=1e-4)
-    assert lower_bound(0.0, 0.0) == 0.0
 
 
 def test_matches_of_a_dropped_version_still_rate_the_other_player() -> None:
