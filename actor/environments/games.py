@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.vector.utils import create_empty_array
 
 from daedalus.actor.environments.bots import Bot, LegalActions
-from daedalus.actor.environments.components import dtype_misfit, leaves, numbered, with_agent, without
+from daedalus.actor.environments.components import dtype_misfit, leaves, numbered, only_of_batch, with_agent, without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     MissingPackageError,
@@ -180,7 +180,7 @@ class GameEnvironments:
     def _chosen(self, actions: Any, seat: int) -> Any:
         """Return the action of a seat that must act: its bot's, or the caller's."""
         bot = self._in_match[seat]
-        return _only(self.action_space, actions, seat) if bot is None else bot.act(*self._newest[seat])
+        return only_of_batch(self.action_space, actions, seat) if bot is None else bot.act(*self._newest[seat])
 
     def _call(self, call: str, number: int, argument: Any) -> list[Outcome]:
         try:
@@ -480,12 +480,3 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
     if len(groups) > 1:
         raise DifferentSpacesError(spec.id, roles_of(list(groups.values()), possible))
     return chosen
-
-
-def _only(space: gymnasium.Space, batch: Any, row: int) -> Any:
-    """Return the action of one seat from the batch of all."""
-    if isinstance(space, gymnasium.spaces.Dict):
-        return {key: _only(part, batch[key], row) for key, part in space.spaces.items()}
-    if isinstance(space, gymnasium.spaces.Tuple):
-        return tuple(_only(part, batch[index], row) for index, part in enumerate(space.spaces))
-    return batch[row]
