@@ -122,8 +122,7 @@ def draw_profiles(groups: Sequence[Group], output: Path) -> None:
 
 def _label(group: Group) -> str:
     """Return the name of a group for a legend: printable, and no formula for matplotlib."""
-    runs = f" ({len(group.runs)} runs)" if len(group.runs) > 1 else ""
-    return one_line(group.name).replace("$", r"\$") + runs
+    return one_line(group.label).replace("$", r"\$")
 
 
 def _figure(width: float, height: float) -> "Figure":

@@ -152,23 +152,17 @@ class RecordedRun:
     @property
     def spec(self) -> RunSpec | None:
         """The settings; None if this release does not know them."""
-        sections: dict[str, dict[str, Any]] = {}
-        for key, value in self.settings.items():
-            section, _, name = key.partition(".")
-            sections.setdefault(section, {})[name] = value
+        sections = {key.partition(".")[0] for key in self.settings}
         try:
-            return RunSpec.model_validate(sections)
+            return RunSpec.model_validate({section: self._section(section) for section in sections})
         except ValidationError:
             return None
 
     @property
     def environment(self) -> EnvironmentSpec | None:
         """Settings of the environment; None if this release does not know them."""
-        values = {
-            key.partition(".")[2]: value for key, value in self.settings.items() if key.startswith("environment.")
-        }
         try:
-            return EnvironmentSpec.model_validate(values)
+            return EnvironmentSpec.model_validate(self._section("environment"))
         except ValidationError:
             return None
 
@@ -180,7 +174,11 @@ class RecordedRun:
     @property
     def lessons(self) -> dict[str, Any]:
         """Settings of the lessons, by parameter."""
-        return {key.partition(".")[2]: value for key, value in self.settings.items() if key.startswith("lessons.")}
+        return self._section("lessons")
+
+    def _section(self, section: str) -> dict[str, Any]:
+        """Return the settings of one section, by name."""
+        return {key.partition(".")[2]: value for key, value in self.settings.items() if key.startswith(f"{section}.")}
 
     def reached(self, threshold: float, *, evaluated: bool = False) -> tuple[float, float]:
         """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.

@@ -30,6 +30,11 @@ class Group(Generic[Run]):
     runs: Sequence[Run]
     unnamed: Sequence[str] = ()  # settings in which the groups differ, and that are not in the name
 
+    @property
+    def label(self) -> str:
+        """The name, and how many runs there are if there are several."""
+        return f"{self.name} ({len(self.runs)} runs)" if len(self.runs) > 1 else self.name
+
 
 def environment_of(groups: Sequence[Group]) -> str:
     """Return the environment that the runs of some groups play; empty if it is unknown."""

@@ -573,8 +573,7 @@ def _lines(groups: Sequence[Group], column: str, by: str) -> tuple[list[Series],
 
 
 def _key_of(group: Group, index: int) -> tuple[str, int, bool]:
-    runs = f" ({len(group.runs)} runs)" if len(group.runs) > 1 else ""
-    return f"{group.name}{runs}", index % SERIES_COLOURS + 1, index >= SERIES_COLOURS
+    return group.label, index % SERIES_COLOURS + 1, index >= SERIES_COLOURS
 
 
 def _legend(keys: Iterable[tuple[str, int, bool]]) -> ET.Element:
