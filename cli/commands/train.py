@@ -107,15 +107,9 @@ DISK_SECONDS, END_SECONDS = 10.0, 90.0
 
 def train(arguments: list[str]) -> int:
     """Run `daedalus train` and return its exit status."""
-    started = process_started()
-    parsed = train_parser().parse_args(arguments)
-    screen = Screen()
-    log_options(parsed).configure(write=screen.out)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
+    parsed, screen, started = _begun(train_parser(), arguments)
     try:
-        _check_listening(parsed)
-        _check_watching(parsed)
-        _check_inference(parsed)
+        _check_machine_options(parsed)
         new = new_run(parsed)
     except (SettingsError, *SECURITY_ERRORS) as error:
         print_error("train", error)
@@ -151,15 +145,9 @@ def train(arguments: list[str]) -> int:
 
 def resume(arguments: list[str]) -> int:
     """Run `daedalus resume` and return its exit status."""
-    started = process_started()
-    parsed = resume_parser().parse_args(arguments)
-    screen = Screen()
-    log_options(parsed).configure(write=screen.out)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
+    parsed, screen, started = _begun(resume_parser(), arguments)
     try:
-        _check_listening(parsed)
-        _check_watching(parsed)
-        _check_inference(parsed)
+        _check_machine_options(parsed)
         if directories := run_directory.role_directories(parsed.directory):
             from daedalus.cli.commands.role_runs import resume_roles
 
@@ -282,27 +270,30 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)  # for `daedalus sweep`
 
 
-def _check_watching(parsed: argparse.Namespace) -> None:
-    """Raise SettingsError if the gateway's packages are missing, or there is no gateway."""
+def _begun(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple[argparse.Namespace, Screen, float]:
+    """Return the options, the terminal, with the logs on it, and when the process started."""
+    started = process_started()
+    parsed = parser.parse_args(arguments)
+    screen = Screen()
+    log_options(parsed).configure(write=screen.out)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
+    return parsed, screen, started
+
+
+def _check_machine_options(parsed: argparse.Namespace) -> None:
+    """Raise SettingsError, or one of SECURITY_ERRORS, for options that this machine cannot follow."""
+    credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
     if parsed.clients and not parsed.watch:
         raise SettingsError("--clients is for the page of the run: add --watch, or start `daedalus gateway`")
-    if not parsed.watch:
-        return
-    from daedalus.launch.gateway_process import GATEWAY_PACKAGES, INSTALL  # with what a gateway imports
+    if parsed.watch:
+        from daedalus.launch.gateway_process import GATEWAY_PACKAGES, INSTALL  # with what a gateway imports
 
-    if not all(map(importlib.util.find_spec, GATEWAY_PACKAGES)):
-        raise SettingsError(f"--watch: {INSTALL}")
-
-
-def _check_inference(parsed: argparse.Namespace) -> None:
+        if not all(map(importlib.util.find_spec, GATEWAY_PACKAGES)):
+            raise SettingsError(f"--watch: {INSTALL}")
     try:
         check_inference(parsed.inference)
     except ValueError as error:
         raise SettingsError(str(error)) from None
-
-
-def _check_listening(parsed: argparse.Namespace) -> None:
-    credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
 
 
 def machine_options(parsed: argparse.Namespace, directory: Path) -> dict[str, Any]:
