@@ -1,7 +1,7 @@
 """The network as an algorithm uses it: forward passes, and the target network."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
@@ -9,6 +9,17 @@ from torch import Tensor, nn
 
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.layers import Components
+
+
+def flat_gradient(loss: Tensor, parameters: Sequence[nn.Parameter], out: Tensor | None = None) -> Tensor:
+    """Return the gradients of a loss [P], in `out` if given; 0 for a parameter that it does not depend on."""
+    gradients = torch.autograd.grad(loss, parameters, materialize_grads=True)
+    return torch.cat([gradient.flatten() for gradient in gradients], out=out)
+
+
+def forward_precision(device: str, *, is_mixed: bool) -> AbstractContextManager[object]:
+    """Return a context for one forward pass: its cache of cast weights must not survive an update of the weights."""
+    return torch.autocast(device, torch.bfloat16) if is_mixed else nullcontext()
 
 
 class FlatParameters:
@@ -29,9 +40,8 @@ class FlatParameters:
             start = end
 
     def differentiated(self, loss: Tensor, out: Tensor | None = None) -> Tensor:
-        """Return the gradients of a loss [P], in `out` if given; 0 for a parameter that it does not depend on."""
-        gradients = torch.autograd.grad(loss, self._parameters, materialize_grads=True)
-        return torch.cat([gradient.flatten() for gradient in gradients], out=out)
+        """See `flat_gradient`."""
+        return flat_gradient(loss, self._parameters, out)
 
     def clip_gradients(self, max_norm: float) -> Tensor:
         """Scale the gradients so that their norm is at most `max_norm`; return their norm before, a scalar.
@@ -108,5 +118,4 @@ class Forward:
         return self._target
 
     def _precision(self, starts: Tensor) -> AbstractContextManager[object]:
-        # A context for each forward pass: its cache of cast weights must not survive an update of the weights.
-        return torch.autocast(starts.device.type, torch.bfloat16) if self._is_mixed else nullcontext()
+        return forward_precision(starts.device.type, is_mixed=self._is_mixed)

@@ -10,14 +10,14 @@ import functools
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from daedalus.algorithms.algorithm import Algorithm, Forward
-from daedalus.algorithms.forward import FlatParameters
+from daedalus.algorithms.forward import FlatParameters, flat_gradient, forward_precision
 from daedalus.algorithms.recording import OperationRecorder
 from daedalus.algorithms.replay_buffer import Transitions
 from daedalus.policy.network.actor_critic import ActorCritic, full_precision
@@ -280,7 +280,7 @@ class Sac(Algorithm):
                 targets = rewards + discounts * following
             values = values.gather(-1, actions.long().expand(2, -1, -1)) if critics.choices else values
             loss = 0.5 * (values.squeeze(-1) - targets).square().mean(-1).sum()
-        return _differentiated(loss, list(critics.parameters())), loss.detach(), moments.detach()
+        return self._flat.differentiated(loss), loss.detach(), moments.detach()
 
     def _of_policy(self, now: Components, noise: Tensor) -> tuple[Tensor, ...]:
         """Return the gradients of the policy and of the temperature, the loss and the entropy of the policy."""
@@ -290,7 +290,7 @@ class Sac(Algorithm):
             outputs, _ = critics(critics.inputs(now, actions), critics.moments)
             values, entropies = self._values(outputs, log_probs)
             loss = -values.mean()
-        gradient = _differentiated(loss, self._network.learned_parameters())
+        gradient = flat_gradient(loss, self._network.learned_parameters())
         entropy = entropies.detach().mean()
         return gradient, (entropy - self._target_entropy).reshape(1), loss.detach(), entropy
 
@@ -319,20 +319,13 @@ class Sac(Algorithm):
         return values + self._log_temperature.exp() * entropies, entropies
 
     def _precision(self) -> AbstractContextManager[object]:
-        device = self._log_temperature.device.type
-        return torch.autocast(device, torch.bfloat16) if self._is_mixed else nullcontext()
+        return forward_precision(self._log_temperature.device.type, is_mixed=self._is_mixed)
 
     def after_update(self, policy_version: int, forward: Forward) -> None:
         """See Algorithm: move the running moments of the critics towards those of the minibatch."""
         self._critics.moments.lerp_(self._batch_moments, 1.0 - _DECAY)
         for of_policy, of_critics in self._convolutions:
             _copy(of_critics, of_policy)
-
-
-def _differentiated(loss: Tensor, parameters: Sequence[Tensor]) -> Tensor:
-    """Return the gradients [P] of a loss, 0 for a parameter that it does not depend on."""
-    gradients = torch.autograd.grad(loss, parameters, materialize_grads=True)
-    return torch.cat([gradient.flatten() for gradient in gradients]).float()
 
 
 def _copy(source: nn.Module, target: nn.Module) -> None:
