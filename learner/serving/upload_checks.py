@@ -87,7 +87,11 @@ def number_violation(rollout: Rollout) -> str:
             return f"{name} has a value that is not finite"
         if max(-low, high) > largest:
             return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
-    for name, values in rollout.episode_info.items():
+    return _info_violation(rollout)
+
+
+def _info_violation(upload: Rollout | Gradient) -> str:
+    for name, values in upload.episode_info.items():
         if not (np.abs(values) <= LARGEST_EPISODE_NUMBER).all():
             return f"episode_info {name!r} has a value that is not finite, or too large"
     return ""
@@ -282,10 +286,7 @@ def _episodes_violation(gradient: Gradient) -> str:
         return "episode_returns has a value that is not finite, or too large"
     if (gradient.episode_lengths < 1).any():
         return "episode_lengths has a value below 1"
-    for name, values in gradient.episode_info.items():
-        if not (np.abs(values) <= LARGEST_EPISODE_NUMBER).all():
-            return f"episode_info {name!r} has a value that is not finite, or too large"
-    return ""
+    return _info_violation(gradient)
 
 
 def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> str:
