@@ -142,14 +142,13 @@ def _actors(actors: Sequence[ActorStatus], width: int, updates_per_batch: int) -
 
 
 def _cells(actor: ActorStatus, updates_per_batch: int) -> dict[str, Text]:
-    answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
     return {
         "actor": Text(one_line(actor.actor)),
         "state": Text("quarantined" if actor.quarantined else "alive" if actor.alive else "gone"),
         "env_steps": Text(f"{actor.env_steps:,}"),
         "/s": Text(short_rate(actor.env_steps_per_second)),
         "lag": Text(policy_lag(actor.policy_lag, updates_per_batch).partition(" (")[0]),
-        "busy": Text(f"{actor.busy_answers / max(answers, 1):.0%}"),
+        "busy": Text(f"{actor.busy_share:.0%}"),
         "host": Text(one_line(actor.host)),
     }
 

@@ -192,6 +192,12 @@ class ActorStatus(Specification):
     silence_limit_seconds: float = 60.0  # `seconds_since_seen` above it is unusual for this actor
     drained_by: str = ""  # who ordered it to leave; empty if nobody did
 
+    @property
+    def busy_share(self) -> float:
+        """Share of the learner's answers that were busy."""
+        answers = self.rollouts_accepted + sum(self.rollouts_rejected.values()) + self.busy_answers
+        return self.busy_answers / max(answers, 1)
+
 
 class RefusedJoin(Specification):
     """Joins that were refused for the same reason, and failures that actors of one host reported."""

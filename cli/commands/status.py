@@ -354,7 +354,7 @@ _COLUMNS: dict[str, _Cell] = {
     "rollout": lambda actor, _: _measured(actor.rollout_seconds),
     "waits": lambda actor, _: _measured(actor.waiting_seconds),
     "trip": lambda actor, _: _measured(actor.round_trip_seconds),
-    "busy": lambda actor, _: f"{_busy_share(actor):.0%}",
+    "busy": lambda actor, _: f"{actor.busy_share:.0%}",
     "accepted": lambda actor, _: f"{actor.rollouts_accepted:,}",
     "missed": lambda actor, _: f"{actor.rollouts_missed:,}" if actor.rollouts_missed else "-",
     "cpu": lambda actor, _: f"{actor.processor_share:.0%}" if actor.processor_share else "-",
@@ -397,11 +397,6 @@ def _actor_table(status: RunStatus) -> list[str]:
 
 def _measured(seconds: float) -> str:
     return short_duration(seconds) if seconds else "-"
-
-
-def _busy_share(actor: ActorStatus) -> float:
-    answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
-    return actor.busy_answers / max(answers, 1)
 
 
 def _actor_texts(actor: ActorStatus) -> list[str]:
