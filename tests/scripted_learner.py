@@ -38,6 +38,7 @@ from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 SPEC = RunSpec.model_validate(
     {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
 )
+SYNCHRONOUS_SPEC = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
 SPACES = vector_spaces(4, 2)
 
 
@@ -178,3 +179,9 @@ class RunningActor:
     def join(self) -> None:
         self._thread.join(LIMIT)
         assert not self._thread.is_alive()
+
+    def end(self) -> None:
+        """Stop the actor, which has not failed."""
+        self.stop.set()
+        self.join()
+        assert self.error is None

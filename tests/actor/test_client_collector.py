@@ -132,10 +132,11 @@ def test_oldest_rollouts_are_dropped_when_nobody_takes_them() -> None:
     assert client.dropped > 0
 
 
-def test_new_policy_acts_from_the_first_step_after_its_weights_came() -> None:
+@pytest.mark.parametrize("steps", [0, 3])
+def test_new_policy_acts_from_the_first_step_after_its_weights_came(steps: int) -> None:
     played = Played(run_spec())
     client, robot = begun(played)
-    drive(client, robot, 3)
+    drive(client, robot, steps)
     client.begin(played.runtime(), played.spec.for_actors(), 4)
     drive(client, robot, 40)  # before its weights came, the previous policy acts, and its rollouts are discarded
     assert not client.has_rollout()
@@ -162,17 +163,6 @@ def test_agent_acts_on_when_another_learner_is_joined_while_it_changes_to_the_po
     assert not client.has_rollout(), "no learner takes the rollouts of the policy before"
     client.load(played.snapshot(2))
     drive(client, robot, 40)
-    assert take(client).policy_version == 2
-
-
-def test_first_action_is_of_a_policy_that_came_although_another_learner_is_joined() -> None:
-    played = Played(run_spec())
-    client, robot = begun(played)
-    client.begin(played.runtime(), played.spec.for_actors(), 4)
-    drive(client, robot, 40)
-    assert not client.has_rollout()
-    client.load(played.snapshot(2))
-    drive(client, robot, 2 * ROWS)
     assert take(client).policy_version == 2
 
 

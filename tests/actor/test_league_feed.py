@@ -109,9 +109,7 @@ def test_an_actor_asks_whom_to_play_and_for_their_policies() -> None:
         assert learner.answer(plan(3, "random")) == LeagueRequest(actor="a", held_revision=2)
         learner.play_until(("training", "newest", "random"))
     finally:
-        actor.stop.set()
-        actor.join()
-    assert actor.error is None
+        actor.end()
 
 
 @pytest.mark.parametrize("damage", [b"no message", encode(Refusal(code="malformed", reason="an older release"))])
@@ -125,9 +123,7 @@ def test_an_answer_that_is_no_plan_does_not_end_the_actor(damage: bytes) -> None
         learner.answer(damage)
         assert learner.play(5) == set()
     finally:
-        actor.stop.set()
-        actor.join()
-    assert actor.error is None
+        actor.end()
 
 
 def test_a_policy_of_another_shape_does_not_play() -> None:
@@ -146,6 +142,4 @@ def test_a_policy_of_another_shape_does_not_play() -> None:
         assert learner.answer(other).player == "v3"
         assert ("training", "newest", "v3") not in learner.play(5)
     finally:
-        actor.stop.set()
-        actor.join()
-    assert actor.error is None
+        actor.end()

@@ -3,7 +3,7 @@
 import numpy as np
 from plain import array_space, choices, plain, plain_spaces
 from processes import LIMIT
-from scripted_learner import SPACES, SPEC, Policy, RunningActor, ScriptedLearner, acknowledge
+from scripted_learner import SPACES, SPEC, SYNCHRONOUS_SPEC, Policy, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.protocol.spec import PolicySpec
 from daedalus.transport.memory import MemoryNetwork
@@ -15,9 +15,7 @@ def test_actor_joins_without_spaces_and_then_with_them(network: MemoryNetwork) -
     asked, counted_in = learner.joins.get(timeout=LIMIT), learner.joins.get(timeout=LIMIT)
     assert asked.spaces is None
     assert (counted_in.spaces, counted_in.environments) == (SPACES, 2)
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
+    actor.end()
 
 
 def test_actor_keeps_a_window_of_numbered_rollouts_in_flight(network: MemoryNetwork, actor: RunningActor) -> None:
@@ -44,9 +42,7 @@ def test_frame_stack_and_memory_follow_the_run(network: MemoryNetwork) -> None:
         rollout, request = learner.receive()
         acknowledge(request, "accepted")
         received.append(rollout)
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
+    actor.end()
     assert [learner.joins.get(timeout=LIMIT).spaces for _ in range(2)] == [None, spaces]
     first, second = received
     frames, later = plain(first.frames), plain(second.frames)
@@ -86,13 +82,11 @@ def test_actor_fenced_by_the_same_learner_epoch_continues_its_sequence(
 
 
 def test_synchronous_actor_replaces_a_rejected_rollout_under_the_same_version(network: MemoryNetwork) -> None:
-    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
-    learner = ScriptedLearner(network, spec)
+    learner = ScriptedLearner(network, SYNCHRONOUS_SPEC)
     actor = RunningActor(network)
     learner.publish(0)
     _, request = learner.receive()
     acknowledge(request, "rejected")
     again, _ = learner.receive()
     assert (again.identity.sequence, again.policy_version) == (1, 0)
-    actor.stop.set()
-    actor.join()
+    actor.end()

@@ -179,9 +179,7 @@ def test_an_answer_of_another_release_is_ignored_beside_one_of_ours(network: Mem
     learners[0].publish(0)
     learners[0].receive()
     assert any("ignored the answer of another learner: the other end uses protocol version" in text for text in LINES)
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
+    actor.end()
 
 
 def of_another_release() -> bytes:
@@ -196,8 +194,7 @@ def test_actor_that_waits_for_another_run_names_the_runs_that_are_there(network:
     of_another_version.serve(keys.join("three", "*"), lambda request: request.reply(of_another_release()))
     actor = RunningActor(network, run="cartpol")
     until(lambda: "waiting for a learner of run 'cartpol'; the runs here are 'one', 'two'" in LINES)
-    actor.stop.set()
-    actor.join()
+    actor.end()
     actor = RunningActor(network, run="cartpol", timeout=0.05)
     actor.join()
     assert str(actor.error) == (

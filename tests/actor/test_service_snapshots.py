@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from log_lines import LINES
 from processes import LIMIT, until
-from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
+from scripted_learner import SYNCHRONOUS_SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session import conversation, session_engine
@@ -27,8 +27,7 @@ def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(networ
     assert [rollout.policy_version for rollout, _ in received] == [3] * len(received)
     assert [rollout.identity.sequence for rollout, _ in received] == list(range(len(received)))
     assert learner.rollouts.empty()
-    actor.stop.set()
-    actor.join()
+    actor.end()
 
 
 def test_rollout_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:
@@ -105,9 +104,7 @@ def test_newer_weights_are_loaded_while_a_rollout_is_incomplete(network: MemoryN
     assert learner.rollouts.empty()
     learner.publish(1)
     assert learner.receive()[0].policy_version == 1
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
+    actor.end()
 
 
 def test_acknowledgement_is_received_while_a_snapshot_is_decoded(
@@ -123,8 +120,7 @@ def test_acknowledgement_is_received_while_a_snapshot_is_decoded(
             assert released.wait(LIMIT)
         return message
 
-    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
-    learner = ScriptedLearner(network, spec)
+    learner = ScriptedLearner(network, SYNCHRONOUS_SPEC)
     actor = RunningActor(network)
     learner.publish(0)
     _, request = learner.receive()
@@ -139,9 +135,7 @@ def test_acknowledgement_is_received_while_a_snapshot_is_decoded(
     finally:
         released.set()
     assert learner.receive()[0].policy_version == 1
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
+    actor.end()
 
 
 def test_actor_requests_a_snapshot_whose_push_was_lost(network: MemoryNetwork, actor: RunningActor) -> None:
@@ -155,28 +149,14 @@ def test_actor_requests_a_snapshot_whose_push_was_lost(network: MemoryNetwork, a
     assert rollout.policy_version == 1
 
 
-def test_synchronous_actor_requests_the_next_version_if_its_push_was_lost(network: MemoryNetwork) -> None:
-    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
-    learner = ScriptedLearner(network, spec)
-    actor = RunningActor(network)
-    learner.publish(0)
-    _, request = learner.receive()
-    learner.publish(1, push=False)
-    acknowledge(request, "accepted", 1)
-    assert learner.receive()[0].policy_version == 1
-    actor.stop.set()
-    actor.join()
-
-
-def test_synchronous_actor_whose_stale_rollout_is_rejected_requests_the_next_version(network: MemoryNetwork) -> None:
+@pytest.mark.parametrize("verdict", ["accepted", "rejected"])
+def test_synchronous_actor_requests_the_next_version_if_its_push_was_lost(network: MemoryNetwork, verdict: str) -> None:
     """Otherwise it would collect with the version that it has, for ever, and every rollout would be stale."""
-    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
-    learner = ScriptedLearner(network, spec)
+    learner = ScriptedLearner(network, SYNCHRONOUS_SPEC)
     actor = RunningActor(network)
     learner.publish(0)
     _, request = learner.receive()
     learner.publish(1, push=False)
-    acknowledge(request, "rejected", 1)
+    acknowledge(request, verdict, 1)
     assert learner.receive()[0].policy_version == 1
-    actor.stop.set()
-    actor.join()
+    actor.end()

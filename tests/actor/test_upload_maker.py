@@ -45,9 +45,7 @@ def test_an_actor_sends_the_gradient_of_its_rollout_in_its_place(network: Memory
         assert message.gradient.keys() == {name for name, _ in POLICY.network.named_parameters()}
         assert any(values.any() for values in message.gradient.values())
         acknowledge(request, "accepted")
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
+    actor.end()
 
 
 def test_the_gradient_is_that_of_the_snapshot_that_played_the_rollout(network: MemoryNetwork) -> None:
@@ -62,9 +60,7 @@ def test_the_gradient_is_that_of_the_snapshot_that_played_the_rollout(network: M
     message = decode(learner.rollouts.get(timeout=LIMIT).payload, Limits())
     assert isinstance(message, Gradient)
     assert restored(message).gradient["value_head.bias"].item() > 50.0
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None
+    actor.end()
 
 
 def test_an_actor_that_uploads_rollouts_never_imports_torch() -> None:

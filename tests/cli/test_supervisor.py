@@ -75,10 +75,27 @@ def test_a_process_that_failed_three_times_is_not_restarted() -> None:
     stop([process.process])
 
 
-def test_a_process_that_crashed_three_times_is_not_restarted() -> None:
-    process = supervised("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
-    assert [message(process), message(process)] == ["worker was killed by signal 11; started again"] * 2
-    with pytest.raises(FailedError, match=r"worker failed 3 times: a fault of native code \(signal 11\)"):
+@pytest.mark.parametrize(
+    ("program", "options", "said", "failure"),
+    [
+        (
+            "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
+            {},
+            "was killed by signal 11",
+            r"failed 3 times: a fault of native code \(signal 11\)",
+        ),
+        (f"raise SystemExit({STOPPED})", {"no_fault": {}}, f"failed with status {STOPPED}", "failed 3 times"),
+        ("pass", {}, "ended before the run", "ended 3 times before the run"),
+    ],
+    ids=["crashes", "has the status of a stopped learner, and is none", "ends, as a module of the user may let it"],
+)
+def test_a_process_that_ends_three_times_is_not_restarted(
+    monkeypatch: pytest.MonkeyPatch, program: str, options: dict[str, Any], said: str, failure: str
+) -> None:
+    monkeypatch.setattr(supervision, "_LEAVING_SECONDS", 0.0)
+    process = supervised(program, **options)
+    assert [message(process), message(process)] == [f"worker {said}; started again"] * 2
+    with pytest.raises(FailedError, match=f"worker {failure}"):
         message(process)
     stop([process.process])
 
@@ -97,14 +114,6 @@ def test_a_crash_long_after_the_start_does_not_add_up(monkeypatch: pytest.Monkey
     process = supervised("import os; os.abort()")
     for _ in range(5):
         assert message(process) == "worker was killed by signal 6; started again"
-    stop([process.process])
-
-
-def test_the_status_of_a_stopped_learner_is_a_failure_of_another_process() -> None:
-    process = supervised(f"raise SystemExit({STOPPED})", no_fault={})
-    assert [message(process), message(process)] == [f"worker failed with status {STOPPED}; started again"] * 2
-    with pytest.raises(FailedError, match="worker failed 3 times"):
-        message(process)
     stop([process.process])
 
 
@@ -167,16 +176,6 @@ def test_a_process_that_ended_before_the_others_is_restarted(monkeypatch: pytest
     assert process.restarts == 0
     monkeypatch.setattr(supervision, "_LEAVING_SECONDS", 0.0)
     assert message(process) == "worker ended before the run; started again"
-    stop([process.process])
-
-
-def test_a_process_that_ends_early_again_and_again_is_not_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A module of the user may call `os._exit(0)`."""
-    process = supervised("pass")
-    monkeypatch.setattr(supervision, "_LEAVING_SECONDS", 0.0)
-    assert [message(process), message(process)] == ["worker ended before the run; started again"] * 2
-    with pytest.raises(FailedError, match="worker ended 3 times before the run"):
-        message(process)
     stop([process.process])
 
 

@@ -17,7 +17,7 @@ import pytest
 from gateways import CARTPOLE, JsonClient, RunningGateway
 from log_lines import LINES
 from processes import LIMIT, until
-from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
+from scripted_learner import SPEC, SYNCHRONOUS_SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
 from daedalus.actor.environments.minari_files import MinariReader
@@ -524,8 +524,7 @@ def test_refusal_of_the_learner_reaches_the_client(learner: ScriptedLearner, con
 def test_clients_of_a_synchronous_run_go_on_between_updates_and_those_rows_are_not_sent(
     network: MemoryNetwork, connect: Connect
 ) -> None:
-    training = SPEC.training.model_copy(update={"algorithm": "a2c"})
-    learner = ScriptedLearner(network, SPEC.model_copy(update={"training": training}))
+    learner = ScriptedLearner(network, SYNCHRONOUS_SPEC)
     learner.publish(0)
     try:
         client = connect()
