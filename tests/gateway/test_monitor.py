@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 from processes import LIMIT, until
-from watched import FakeSource, actor_status, run_status
+from statuses import actor_status, run_status
+from watched import FakeSource
 
 from daedalus.gateway.watching import monitor as monitor_module
 from daedalus.gateway.watching.monitor import RunMonitor

@@ -18,7 +18,8 @@ from gateways import RunningGateway
 from league_statuses import LEAGUE
 from processes import ENDLESS, LIMIT, Running, processes_mentioning, starting, until
 from scripted_learner import SPEC, ScriptedLearner, acknowledge
-from watched import HOSTILE, actor_status, observed, run_status
+from statuses import actor_status, run_status
+from watched import HOSTILE, observed
 
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import OperatorToken
@@ -263,7 +264,8 @@ def test_a_page_before_the_learner_and_after_the_end_says_so(gateway: RunningGat
     gateway.call(lambda: gateway.data.show(gateway.data.seen.__class__(state="waiting")))
     page.wait_for_selector("#notices:has-text('No learner has answered yet')")
     folder = replace(FOLDER, ends=("Report: runs/r/report.html",))
-    show(gateway, run_status(), state="ended", reason="the run is over: the learner has finished", folder=folder)
+    status = run_status(episode_return_mean=12.5)
+    show(gateway, status, state="ended", reason="the run is over: the learner has finished", folder=folder)
     page.wait_for_selector("#notices:has-text('The run has ended: the run is over')")
     assert "return 12.5 after 100 env_steps" in text_of(page, "#notices")
     assert "Report: runs/r/report.html" in text_of(page, "#notices")

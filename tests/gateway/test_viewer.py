@@ -18,7 +18,8 @@ from certificates import change_certificates, make_certificates
 from gateways import RunningGateway
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
-from watched import FakeSource, actor_status, observed, run_status
+from statuses import actor_status, run_status
+from watched import FakeSource, observed
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -121,7 +122,7 @@ def test_a_page_that_is_opened_late_receives_the_whole_run(gateway: RunningGatew
     show(gateway, run_status((actor_status("a", rollouts_rejected={"stale": 2}),)), rows)
     viewer = watch()
     run = viewer.receive("run")
-    assert (run["state"], run["status"]["run"], "actors" in run["status"]) == ("running", "r", False)
+    assert (run["state"], run["status"]["run"], "actors" in run["status"]) == ("running", "mine", False)
     actors = viewer.receive("actors")
     actor = dict(zip(actors["columns"], actors["rows"][0], strict=True))
     assert (actor["actor"], actor["rollouts_rejected"]) == ("a", {"stale": 2})

@@ -1,4 +1,4 @@
-"""Statuses for tests of the page, and a source that returns what the test says."""
+"""A source that returns what the test says, and observations of it, for tests of the page."""
 
 import threading
 from dataclasses import replace
@@ -6,49 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from daedalus.gateway.watching.page_data import Observation
-from daedalus.protocol.messages import ActorStatus, Event, EventsPage, MetricsPage, MetricsReport, Order, RunStatus
+from daedalus.protocol.messages import Event, EventsPage, MetricsPage, MetricsReport, Order, RunStatus
 from daedalus.transport.interface import TransportError
 
 HOSTILE = '<img src=x onerror="document.title=1">'  # a text of a peer
-
-
-def actor_status(name: str, **fields: object) -> ActorStatus:
-    values: dict[str, object] = {
-        **dict.fromkeys(("host", "software", "address", "quarantined"), ""),
-        **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed", "env_steps"), 1),
-        **dict.fromkeys(("busy_answers", "policy_lag"), 0),
-        **dict.fromkeys(("seconds_since_seen", "env_steps_per_second", "bytes_up_per_hour"), 1.0),
-        "bytes_down_per_hour": 1.0,
-        "epsilon": 0.0,
-        "rollouts_rejected": {},
-        "alive": True,
-        "compact_snapshots": False,
-    }
-    return ActorStatus.model_validate({**values, "actor": name, **fields}, strict=False)
-
-
-def run_status(actors: tuple[ActorStatus, ...] = (), **fields: object) -> RunStatus:
-    values: dict[str, object] = {
-        **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second", "policy_lag_mean"), 2.5),
-        **dict.fromkeys(("updates", "updates_skipped", "queue_bytes", "queue_bytes_limit"), 3),
-        **dict.fromkeys(("rollouts_accepted", "rollouts_missed", "busy_answers"), 4),
-        **dict.fromkeys(("actors_quarantined", "actors_gone"), 0),
-        "run": "r",
-        "learner_epoch": 1,
-        "algorithm": "impala",
-        "environment": "CartPole-v1",
-        "problems": (),
-        "env_steps": 100,
-        "env_steps_budget": 1000,
-        "episode_return_mean": 12.5,
-        "checkpoint_age_seconds": None,
-        "certificate_days_left": None,
-        "rollouts_rejected": {},
-        "actors_alive": len(actors),
-        "refused_joins": (),
-        "actors": actors,
-    }
-    return RunStatus.model_validate({**values, **fields})
 
 
 class FakeSource:

@@ -32,7 +32,7 @@ def actor_status(name: str, **changes: Any) -> ActorStatus:
     return ActorStatus(**{**values, **changes})
 
 
-def run_status(**changes: Any) -> RunStatus:
+def run_status(actors: Sequence[ActorStatus] = (), **changes: Any) -> RunStatus:
     values = {
         "run": "mine",
         "learner_epoch": 1,
@@ -57,10 +57,10 @@ def run_status(**changes: Any) -> RunStatus:
         "rollouts_missed": 4,
         "busy_answers": 5,
         "refused_joins": (),
-        "actors": (),
+        "actors": actors,
         "software": "daedalus-rl 1.0",
     }
-    return RunStatus(**{**values, **_counts(changes.get("actors", ())), **changes})
+    return RunStatus(**{**values, **_counts(actors), **changes})
 
 
 def _counts(actors: Sequence[ActorStatus]) -> dict[str, int]:
