@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daedalus.cli.commands.train import (
-    DISK_SECONDS,
-    END_SECONDS,
     left_report,
     machine_options,
     report,
     resume_choice,
     show,
+    stopped_text,
+    stopping_event,
 )
 from daedalus.cli.screen import Screen
 from daedalus.launch.child_output import ChildOutput
@@ -23,7 +23,7 @@ from daedalus.launch.environment_check import EnvironmentProblemError
 from daedalus.launch.local_run import LocalRun, RunFailedError, RunStoppedError, UnsavedError
 from daedalus.launch.local_training import evaluate_run
 from daedalus.launch.logs import print_error, say
-from daedalus.launch.process_lifecycle import exit_with_parent, status_at_start, stop_on_signals
+from daedalus.launch.process_lifecycle import status_at_start
 from daedalus.launch.resumed_run import locked_to_resume, resumed_run, status_of
 from daedalus.launch.role_training import RoleRun, RoleTraining, check_roles, seats_of
 from daedalus.launch.run_choice import NewRun, create_run
@@ -168,10 +168,7 @@ def _resumed(parsed: argparse.Namespace, directories: Mapping[str, Path], starte
 
 def _run(roles: _Roles, parsed: argparse.Namespace, screen: Screen, command: str) -> int:
     """Train and evaluate the runs, print the results, and return the exit status."""
-    # A disk that does not answer may hold this thread. The child processes then end with this one, by themselves.
-    stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=DISK_SECONDS, end_seconds=END_SECONDS)
-    if parsed.exit_with_parent:
-        exit_with_parent(stopping)
+    stopping = stopping_event(exits_with_parent=parsed.exit_with_parent)
     seats = seats_of(roles.specs)
 
     def with_output(role: str, run: LocalRun) -> RoleRun:
@@ -199,8 +196,7 @@ def _run(roles: _Roles, parsed: argparse.Namespace, screen: Screen, command: str
         trained = [run.trained for run in roles.runs.values() if run.trained is not None]
         return max([*statuses.values(), *trained, 3 if roles.missed else 0])
     except RunStoppedError as error:
-        by = f" by {error}" if str(error) else ""
-        show(f"stopped{by}; continue with: {roles.resume_command}", command)
+        show(stopped_text(error, roles.resume_command), command)
         return 1
     except RunFailedError as error:
         if str(error):

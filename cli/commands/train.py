@@ -7,6 +7,7 @@ import os
 import shlex
 import signal
 import sys
+import threading
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -102,7 +103,7 @@ exit status: as of daedalus train"""
 
 # After a signal: for a call that uses the disk, and then for the end of the child processes, of which the learner takes
 # the longest
-DISK_SECONDS, END_SECONDS = 10.0, 90.0
+_DISK_SECONDS, _END_SECONDS = 10.0, 90.0
 
 
 def train(arguments: list[str]) -> int:
@@ -323,10 +324,7 @@ def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: boo
     if live:
         run = replace(run, observer=TrainingDisplay(screen, run_directory.run_name(directory)))
     output = ChildOutput(directory / run_directory.OUTPUT, screen.out, screen.err)
-    # A disk that does not answer may hold this thread. The child processes then end with this one, by themselves.
-    stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=DISK_SECONDS, end_seconds=END_SECONDS)
-    if exits_with_parent:
-        exit_with_parent(stopping)
+    stopping = stopping_event(exits_with_parent=exits_with_parent)
 
     def show_end(end: RunEnd) -> None:
         show("\n".join([report(run, end.summary), left_report(directory)]), command)
@@ -339,9 +337,7 @@ def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: boo
             streams = output.unlimited_pipes if live else inherited
             return run_locally(run, stopping, output, streams, show_end).status
     except RunStoppedError as error:
-        by = f" by {error}" if str(error) else ""
-        left, how = left_report(directory), f"stopped{by}; continue with: {resume_command(run)}"
-        show("\n".join(filter(None, [left, how])), command)
+        show("\n".join(filter(None, [left_report(directory), stopped_text(error, resume_command(run))])), command)
         return 1
     except RunFailedError as error:
         if str(error):
@@ -353,6 +349,20 @@ def _run(run: LocalRun, screen: Screen, lock: RunLock, *, exits_with_parent: boo
         if not isinstance(error, UnsavedError) and checkpoints(directory):
             say(f"when that is corrected, continue with: {resume_command(run)}", sys.stderr)
         return error.status
+
+
+def stopping_event(*, exits_with_parent: bool) -> threading.Event:
+    """Return the event that a signal sets, or the end of the process that started this one."""
+    # A disk that does not answer may hold this thread. The child processes then end with this one, by themselves.
+    stopping = stop_on_signals(exit_if_stuck=True, stuck_seconds=_DISK_SECONDS, end_seconds=_END_SECONDS)
+    if exits_with_parent:
+        exit_with_parent(stopping)
+    return stopping
+
+
+def stopped_text(error: RunStoppedError, resume: str) -> str:
+    """Return who stopped the training, and the command that continues it."""
+    return f"stopped{f' by {error}' if str(error) else ''}; continue with: {resume}"
 
 
 def left_report(directory: Path) -> str:
