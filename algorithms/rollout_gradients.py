@@ -14,6 +14,7 @@ from daedalus.algorithms.gradient_inputs import TARGET, restored, unpacked
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.normalization import Moments, ObservationStatistics, RewardNormalizer, observations_name
 from daedalus.policy.acting.program_check import PolicyError
+from daedalus.policy.acting.torch_runtime import load_weights
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.compact import bfloat16, float32, planes
@@ -56,22 +57,14 @@ class RolloutGradients:
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """Use the weights of a snapshot in all later calls. Raises PolicyError if they do not fit."""
-        for name, parameter in self._loaded.items():
-            if name not in weights:
-                raise PolicyError(f"the snapshot lacks the weights {name!r} of the network")
-            if weights[name].shape != tuple(parameter.shape):
-                raise PolicyError(
-                    f"weights {name!r} are {weights[name].shape}, the network requires {tuple(parameter.shape)}"
-                )
         statistics = self._computer.own_statistics
         try:
             inputs = unpacked(weights[GRADIENT_INPUTS])
             given = {name: restored(weights[name], tuple(values.shape)) for name, values in statistics.items()}
         except (KeyError, ValueError) as error:
             raise PolicyError(f"the snapshot has no numbers to compute gradients with: {error}") from None
+        load_weights(weights, self._loaded, self._loaded)
         with torch.no_grad():
-            for name, parameter in self._loaded.items():
-                parameter.copy_(torch.from_numpy(weights[name].copy()))
             for name, values in statistics.items():
                 values.copy_(given[name])
         self._entropy_bonus = inputs.entropy_bonus

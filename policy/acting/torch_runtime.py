@@ -1,5 +1,7 @@
 """PolicyRuntime that runs the torch network itself, for actors that have torch installed (`--runtime torch`)."""
 
+from collections.abc import Iterable, Mapping
+
 import numpy as np
 import torch
 
@@ -9,6 +11,26 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import LossSpec, PolicySpec
+
+
+def load_weights(
+    weights: Mapping[str, np.ndarray], parameters: Mapping[str, torch.Tensor], needed: Iterable[str]
+) -> None:
+    """Copy a snapshot's weights into parameters, of which only those that are `needed` must be in it.
+
+    Raises PolicyError if they do not fit; nothing has changed then.
+    """
+    missing = [name for name in needed if name not in weights]
+    if missing:
+        raise PolicyError(f"the snapshot lacks the weights {missing[0]!r} of the network")
+    given = {name: (weights[name], parameter) for name, parameter in parameters.items() if name in weights}
+    for name, (values, parameter) in given.items():
+        if values.shape != tuple(parameter.shape):
+            raise PolicyError(f"weights {name!r} are {values.shape}, the network requires {tuple(parameter.shape)}")
+    with torch.no_grad():
+        for values, parameter in given.values():
+            # Copied: torch requires writable memory, and a snapshot's arrays are read-only.
+            parameter.copy_(torch.from_numpy(values.copy()))
 
 
 class TorchRuntime:
@@ -64,18 +86,7 @@ class TorchRuntime:
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """See PolicyRuntime. The value head and its encoder may be absent: acting does not use them."""
-        missing = [name for name in self._acting if name not in weights]
-        if missing:
-            raise PolicyError(f"the snapshot lacks the weights {missing[0]!r} of the network")
-        for name, parameter in self._parameters.items():
-            if name in weights and weights[name].shape != tuple(parameter.shape):
-                raise PolicyError(
-                    f"weights {name!r} are {weights[name].shape}, the network requires {tuple(parameter.shape)}"
-                )
-        for name, parameter in self._parameters.items():
-            if name in weights:
-                # Copied: torch requires writable memory, and a snapshot's arrays are read-only.
-                parameter.copy_(torch.from_numpy(weights[name].copy()))
+        load_weights(weights, self._parameters, self._acting)
 
     def act(
         self,
