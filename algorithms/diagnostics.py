@@ -8,20 +8,17 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import explained_variance, mean, shares_of, variance
-from daedalus.protocol.spaces import DiscreteSpace, Spaces
+from daedalus.protocol.spaces import Spaces
 
 
 class ActionCounts:
     """Counts over batches, on a device."""
 
     def __init__(self, spaces: Spaces, device: torch.device) -> None:
-        discrete = {name: space for name, space in spaces.actions.items() if isinstance(space, DiscreteSpace)}
-        self._counts = {
-            name: torch.zeros(space.choices, dtype=torch.int64, device=device) for name, space in discrete.items()
-        }
+        discrete = spaces.discrete_actions.items()
+        self._counts = {name: torch.zeros(space.choices, dtype=torch.int64, device=device) for name, space in discrete}
         self._first_choices = {  # of each variable among all choices of its component
-            name: torch.tensor([0, *itertools.accumulate(space.counts[:-1])], device=device)
-            for name, space in discrete.items()
+            name: torch.tensor([0, *itertools.accumulate(space.counts[:-1])], device=device) for name, space in discrete
         }
 
     def add(self, batch: Batch) -> None:

@@ -138,9 +138,7 @@ def _gym(space: _Component) -> gymnasium.Space:
         case DiscreteSpace():
             return gym.MultiDiscrete(list(space.counts))
         case ContinuousSpace():
-            low = np.array([-np.inf if bound is None else bound for bound in space.low], np.float32)
-            high = np.array([np.inf if bound is None else bound for bound in space.high], np.float32)
-            return gym.Box(low, high, dtype=np.float32)
+            return gym.Box(*space.limits(), dtype=np.float32)
 
 
 def _nested_space(components: Mapping[str, _Component], *, bare: str) -> gymnasium.Space:
@@ -271,8 +269,7 @@ def _checked_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: st
     else:
         with np.errstate(over="ignore"):
             numbers = numbers.astype(np.float32)  # as the bounds are
-        low = np.array([-np.inf if bound is None else bound for bound in space.low], np.float32)
-        high = np.array([np.inf if bound is None else bound for bound in space.high], np.float32)
+        low, high = space.limits()
         fits = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
     if not fits.all():
         raise ClientError("misfit", f"{what} is outside its space, {space}")

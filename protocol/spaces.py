@@ -257,6 +257,12 @@ class ContinuousSpace(Specification):
         """Whether every action has both bounds."""
         return None not in self.low and None not in self.high
 
+    def limits(self, dtype: type[np.floating] = np.float32) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest values [D], infinite without a bound."""
+        low = [-np.inf if bound is None else bound for bound in self.low]
+        high = [np.inf if bound is None else bound for bound in self.high]
+        return np.array(low, dtype), np.array(high, dtype)
+
     @property
     def dtype(self) -> Literal["float32"]:
         """Data type of values in messages."""
@@ -313,11 +319,7 @@ class Spaces(Specification):
     @property
     def masks(self) -> dict[str, int]:
         """Number of choices in the mask of each masked action component."""
-        return {
-            name: space.choices
-            for name, space in self.actions.items()
-            if isinstance(space, DiscreteSpace) and space.masked
-        }
+        return {name: space.choices for name, space in self.discrete_actions.items() if space.masked}
 
     @property
     def order(self) -> ComponentOrder:
@@ -336,6 +338,16 @@ class Spaces(Specification):
             names = sorted(spaces)
             update[kind] = {names[place]: spaces[names[place]] for place in places}
         return self.model_copy(update=update)
+
+    @property
+    def discrete_actions(self) -> dict[str, DiscreteSpace]:
+        """The components of the action that are choices."""
+        return {name: space for name, space in self.actions.items() if isinstance(space, DiscreteSpace)}
+
+    @property
+    def continuous_numbers(self) -> int:
+        """How many numbers of an action are continuous."""
+        return sum(space.size for space in self.actions.values() if isinstance(space, ContinuousSpace))
 
     @property
     def only_choice(self) -> DiscreteSpace | None:

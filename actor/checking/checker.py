@@ -24,7 +24,7 @@ from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one,
 from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import DiscreteSpace, Spaces, unfit_code
+from daedalus.protocol.spaces import Spaces, unfit_code
 from daedalus.protocol.spec import EnvironmentSpec
 
 _RESETS, _SECONDS = 20, 2.0  # the most resets, and the time for those after the second
@@ -275,8 +275,7 @@ def mask_warning(spaces: Spaces, info: Any, frames: Mapping[str, np.ndarray]) ->
       info: of one environment, or of one agent of a game.
       frames: its observation, by component.
     """
-    discrete = [space for space in spaces.actions.values() if isinstance(space, DiscreteSpace)]
-    choices = sum(space.choices for space in discrete)
+    choices = sum(space.choices for space in spaces.discrete_actions.values())
     if spaces.masks or choices < 2:
         return ""
     for where, values in (("info", info), ("the observation", frames)):

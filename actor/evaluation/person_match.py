@@ -200,8 +200,7 @@ def checked_action(
             if name in masks and not masks[name][first + checked[name]].all():
                 raise ValueError("this move is not legal now: choose another")
         else:
-            low = np.array([-np.inf if bound is None else bound for bound in space.low])
-            high = np.array([np.inf if bound is None else bound for bound in space.high])
+            low, high = space.limits(np.float64)
             if not (np.isfinite(values) & (values >= low) & (values <= high)).all():
                 raise ValueError(f"{name} must be numbers within {space}")
             # The run's actions are scaled to [-1, 1] where they have both bounds: see ContinuousSpace.

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal
 
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, Spaces
 
 Kind = Literal["vectors_discrete", "vectors_continuous", "images", "large_images"]
 _UNKNOWN: Kind = "vectors_discrete"  # for an environment whose spaces are not known
@@ -40,7 +40,7 @@ def default_settings(
     settings = tomllib.loads(file.read_text("utf-8"))
     if kind == "large_images" and spaces is not None and any(space.image_shape[0] != _RGB for space in _images(spaces)):
         del settings["environment"]["grey"]
-    if spaces is not None and _has_continuous(spaces):
+    if spaces is not None and spaces.continuous_numbers:
         # The bonus would widen a Gaussian for nothing: noise beyond the bounds is clipped (docs/results.md).
         settings["training"]["entropy_bonus"] = 0.0
         settings["training"].pop("entropy_bonus_final", None)
@@ -108,11 +108,7 @@ def kind_of(spaces: Spaces, coded: Collection[str] = ()) -> Kind:
     images = _images(spaces, coded)
     if images:
         return "large_images" if any(max(space.image_shape[1:]) > _LARGE for space in images) else "images"
-    return "vectors_continuous" if _has_continuous(spaces) else "vectors_discrete"
-
-
-def _has_continuous(spaces: Spaces) -> bool:
-    return any(isinstance(space, ContinuousSpace) for space in spaces.actions.values())
+    return "vectors_continuous" if spaces.continuous_numbers else "vectors_discrete"
 
 
 def _noise_scale(spaces: Spaces) -> float:
@@ -120,8 +116,7 @@ def _noise_scale(spaces: Spaces) -> float:
 
     With the noise that MountainCarContinuous needs in its one number, Ant hardly learns with eight (docs/results.md).
     """
-    numbers = sum(space.size for space in spaces.actions.values() if isinstance(space, ContinuousSpace))
-    return min(1.0, math.sqrt(_FULL_NOISE / numbers))
+    return min(1.0, math.sqrt(_FULL_NOISE / spaces.continuous_numbers))
 
 
 def _images(spaces: Spaces, coded: Collection[str] = ()) -> list[ArraySpace]:

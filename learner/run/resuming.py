@@ -211,7 +211,7 @@ def other_network(policy: SavedPolicy, spec: PolicySpec, spaces: Spaces) -> str:
     different: dict[str, tuple[Any, Any]] = {"encoder": names, "codes": (before.codes, spec.codes)}
     if "mlp" in names[1] or "grid" in names[1] or ":" in names[1]:
         different["activation"] = before.activation, spec.activation
-    if any(isinstance(space, ContinuousSpace) for space in spaces.actions.values()):
+    if spaces.continuous_numbers:
         different["distribution"] = before.distribution, spec.distribution
     for name, (there, here) in different.items():
         if there != here:

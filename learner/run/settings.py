@@ -20,7 +20,7 @@ from daedalus.learner.run.run_files import RunDataError, read_toml
 from daedalus.learner.run.setting_errors import ambiguous, known_names, one_line, unknown_setting
 from daedalus.policy.component_inputs import encoded_spaces, normalized_components
 from daedalus.protocol.algorithms import check_algorithm, is_own
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.texts import exact_number, without_secrets
 
@@ -344,7 +344,7 @@ def unread_settings(spec: RunSpec, spaces: Spaces | None = None) -> set[str]:
 def _unread_with(spec: RunSpec, spaces: Spaces) -> set[str]:
     """Return the settings of `policy` that nothing reads with these spaces."""
     policy, replay, found = spec.policy, spec.algorithm.replay, set[str]()
-    if not (replay or any(isinstance(space, ContinuousSpace) for space in spaces.actions.values())):
+    if not (replay or spaces.continuous_numbers):
         found |= {"policy.distribution", *_OF_GAUSSIANS}
     encoded = encoded_spaces(policy, spaces.observations)
     others = [each for each in encoded.values() if not (isinstance(each, ArraySpace) and each.is_image)]

@@ -145,8 +145,7 @@ def _mask_violation(rollout: Rollout, actions: np.ndarray, mask: np.ndarray, spa
 
 def _log_prob_violation(rollout: Rollout, spaces: Spaces) -> str:
     """A probability is at most 1. A density has no such bound, but that of a learned distribution is limited."""
-    continuous = sum(space.size for space in spaces.actions.values() if isinstance(space, ContinuousSpace))
-    largest = _MAX_LOG_DENSITY * continuous
+    largest = _MAX_LOG_DENSITY * spaces.continuous_numbers
     if (rollout.behaviour_log_probs > largest + 1e-4).any():
         return f"behaviour_log_probs has a value above {largest:g}"
     return ""
@@ -165,8 +164,8 @@ def gradient_limits(spec: RunSpec, shapes: Shapes, spaces: Spaces, environments:
     size = sum(4 * math.prod(shape) + _ARRAY_BYTES for shape in shapes.values())
     moments = expected_moments(spec, spaces)
     size += sum(8 * math.prod(shape) + _ARRAY_BYTES for shape in moments.values())
-    discrete = [space for space in spaces.actions.values() if isinstance(space, DiscreteSpace)]
-    size += sum(8 * space.choices + _ARRAY_BYTES for space in discrete)
+    discrete = spaces.discrete_actions
+    size += sum(8 * space.choices + _ARRAY_BYTES for space in discrete.values())
     episodes = spec.collection.rollout_length * environments
     size += (12 + 8 * len(spec.lessons)) * episodes + len(spec.lessons) * _ARRAY_BYTES
     size += MAX_INFO_NAMES * (4 * MAX_INFO_VALUES + _ARRAY_BYTES) + _MAX_METRICS * _ARRAY_BYTES
@@ -253,7 +252,7 @@ def _moments_violation(gradient: Gradient, expected: dict[str, tuple[int, ...]])
 
 
 def _counts_violation(gradient: Gradient, spaces: Spaces) -> str:
-    discrete = {name: space for name, space in spaces.actions.items() if isinstance(space, DiscreteSpace)}
+    discrete = spaces.discrete_actions
     if gradient.action_counts.keys() != discrete.keys():
         return f"action_counts are of {listed_names(gradient.action_counts)}, expected {listed_names(discrete)}"
     for name, space in discrete.items():
