@@ -2,9 +2,10 @@
 
 import difflib
 import importlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from types import ModuleType
+from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -154,6 +155,18 @@ def playing_error(environment: str, call: str, error: BaseException) -> Environm
             break
     print_traceback(error)
     return EnvironmentSetupError(f"environment {environment}: {call} raises {first_line(error)}{place_of(error)}")
+
+
+def close_each(environments: Iterable[Any]) -> None:
+    """Close environments, then raise the first exception that one of them raised."""
+    errors: list[BaseException] = []
+    for environment in environments:
+        try:
+            environment.close()
+        except (Exception, SystemExit) as error:  # of the user's code
+            errors.append(error)
+    if errors:
+        raise errors[0]
 
 
 def described(space: object) -> str:

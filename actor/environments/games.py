@@ -20,6 +20,7 @@ from daedalus.actor.environments.components import dtype_misfit, leaves, numbere
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     MissingPackageError,
+    close_each,
     creation_errors,
     described,
     hint_of_count,
@@ -311,14 +312,10 @@ class GameEnvironments:
 
 def close_copies(name: str, environments: Sequence[Any]) -> None:
     """Close all copies of a game, then raise the first exception that one of them raised."""
-    errors: list[BaseException] = []
-    for environment in environments:
-        try:
-            environment.close()
-        except (Exception, SystemExit) as error:  # of the user's code
-            errors.append(error)
-    if errors:
-        raise EnvironmentSetupError(f"environment {name}: close raises {first_line(errors[0])}") from errors[0]
+    try:
+        close_each(environments)
+    except (Exception, SystemExit) as error:  # of the user's code
+        raise EnvironmentSetupError(f"environment {name}: close raises {first_line(error)}") from error
 
 
 def mask_of(observation: Any, info: Any) -> Any:

@@ -18,6 +18,7 @@ from daedalus.actor.checking.violations import observation_violations
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
+    close_each,
     creation_errors,
     hint_of_count,
     playing_error,
@@ -99,14 +100,7 @@ class EnvironmentsInTurn(SyncVectorEnv):
     def close_extras(self, **_options: Any) -> None:
         """Close all environments, then raise the first exception that one of them raised."""
         self.closed = True  # also after an exception: the environments would be closed again
-        errors: list[BaseException] = []
-        for environment in getattr(self, "envs", ()):  # gymnasium 1.1 closes also what could not be made
-            try:
-                environment.close()
-            except (Exception, SystemExit) as error:  # of the user's code
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        close_each(getattr(self, "envs", ()))  # gymnasium 1.1 closes also what could not be made
 
     def _add_info(self, vector_infos: dict[str, Any], env_info: dict[str, Any], env_num: int) -> dict[str, Any]:
         if self._collecting:  # the base class calls this method again for a map in `info`
