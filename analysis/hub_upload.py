@@ -9,14 +9,13 @@ from typing import Any
 
 from daedalus.analysis.model_card import model_card
 from daedalus.analysis.recorded_run import SECONDS, RunRecord, read_record
+from daedalus.analysis.run_archive import secret_settings
 from daedalus.analysis.run_selection import one_run
-from daedalus.learner.reporting.trackers.tracker import flat
 from daedalus.learner.run.run_directory import CONFIG, EVALUATION, METRICS, VERSIONS
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.hub import LIMITS, HubError, check_repository, hub_api, hub_errors
 from daedalus.policy.saving.saved_policy import SavedPolicy, export_policy, find_policy
 from daedalus.policy.saving.sealed import MANIFEST
-from daedalus.protocol.texts import is_secret
 from daedalus.transport.private_address import private_folder
 
 _logger = logging.getLogger(__name__)
@@ -72,12 +71,11 @@ def push(directory: Path, repository: str, *, private: bool) -> str:
 
 def policy_files(record: RunRecord, policy: SavedPolicy, repository: str) -> dict[str, bytes]:
     """Return the files of the repository by their names. Raises DamagedError, HubError, RunDataError."""
-    for name, value in flat(policy.spec.model_dump(mode="json")):
-        if isinstance(value, str | list) and is_secret(name.rpartition(".")[2], str(value)):
-            raise HubError(
-                f"{name} holds a password or a token, which would be published: train without it in the settings (let "
-                "the environment read it from a variable), and push that run"
-            )
+    for name in secret_settings(policy.spec):
+        raise HubError(
+            f"{name} holds a password or a token, which would be published: train without it in the settings (let "
+            "the environment read it from a variable), and push that run"
+        )
     if folders := [name for name in policy.spec.league.opponents if Path(name).is_dir()]:
         _logger.warning(
             "league.opponents names folders of this machine, and their names become public in %s and %s: %s",

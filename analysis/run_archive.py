@@ -280,11 +280,16 @@ def _needed(directory: Path) -> Iterator[str]:
         return
     if modules := module_names(spec):
         yield f"not in it: the modules {', '.join(modules)}, which the run imports: take their files along"
-    for name, value in flat(spec.model_dump(mode="json")):
-        if isinstance(value, str | list) and is_secret(name.rpartition(".")[2], str(value)):
-            yield f"{names.CONFIG}, which is in it, holds a password or a token: {name}; keep the archive secret"
+    for name in secret_settings(spec):
+        yield f"{names.CONFIG}, which is in it, holds a password or a token: {name}; keep the archive secret"
     if not checkpoints(directory):
         yield "the run has no checkpoint: it can be repeated from its settings, but not resumed or evaluated"
+
+
+def secret_settings(spec: RunSpec) -> list[str]:
+    """Return the names of the settings that hold a password or a token."""
+    values = [each for each in flat(spec.model_dump(mode="json")) if isinstance(each[1], str | list)]
+    return [name for name, value in values if is_secret(name.rpartition(".")[2], str(value))]
 
 
 def module_names(spec: RunSpec) -> list[str]:
