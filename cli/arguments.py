@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
-from daedalus.launch.logs import LEVELS, LogOptions
+from daedalus.launch.logs import LEVELS, LogOptions, print_error
 from daedalus.launch.supervision import Inference
 from daedalus.policy.user_modules import ModuleNotAllowedError, allow_words
 
@@ -117,6 +117,13 @@ def add_allow_module(options: argparse._ActionsContainer, source: str) -> None:
 def allowing(error: ModuleNotAllowedError, command: Sequence[str]) -> str:
     """Return a message with the command line to type, if the user trusts the modules."""
     return f"{error.reason}; if you trust that code, type: {shlex.join([*command, *allow_words(error.modules)])}"
+
+
+def print_policy_error(command: str, error: Exception, arguments: Sequence[str]) -> int:
+    """Print why a command cannot use a policy, and how to allow its modules; return the exit status."""
+    refused = error.__cause__ if isinstance(error.__cause__, ModuleNotAllowedError) else None
+    print_error(command, allowing(refused, ["daedalus", command, *arguments]) if refused else error)
+    return 2 if refused else 1
 
 
 def _module(name: str) -> str:

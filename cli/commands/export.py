@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import get_args
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.cli.arguments import add_allow_module, add_logging, allowing, command_parser, whole_number
+from daedalus.cli.arguments import add_allow_module, add_logging, command_parser, print_policy_error, whole_number
 from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.saving.hub import HubError, RepositoryNameError
 from daedalus.policy.saving.onnx_graph import ExportError, Quantization
 from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_modules import ModuleNotAllowedError
 from daedalus.protocol.texts import short_number
 
 _CHECKED_STEPS, _EPISODES = 100, 10
@@ -99,11 +98,7 @@ def export(arguments: list[str]) -> int:
         print_error("export", error)
         return 2
     except (DamagedError, EnvironmentSetupError, ExportError, HubError, NoPolicyError, PolicyError) as error:
-        if isinstance(reason := error.__cause__, ModuleNotAllowedError):
-            print_error("export", allowing(reason, ["daedalus", "export", *arguments]))
-            return 2
-        print_error("export", error)
-        return 1
+        return print_policy_error("export", error, arguments)
     except KeyboardInterrupt:
         print_error("export", "stopped")
         return 1

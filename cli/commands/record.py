@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.cli.arguments import add_allow_module, add_logging, allowing, command_parser, whole_number
+from daedalus.cli.arguments import add_allow_module, add_logging, command_parser, print_policy_error, whole_number
 from daedalus.launch.logs import configure_logging, print_error, say
 from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, modules_of
+from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spec import EnvironmentSpec
 
 if TYPE_CHECKING:
@@ -127,11 +127,7 @@ def record(arguments: list[str]) -> int:
         with redirect_stdout(sys.stderr):  # the environment may print
             return _record(parsed, keys, idle, axes)
     except (DamagedError, DatasetError, EnvironmentSetupError, NoPolicyError, PolicyError) as error:
-        if isinstance(reason := error.__cause__, ModuleNotAllowedError):
-            print_error("record", allowing(reason, ["daedalus", "record", *arguments]))
-            return 2
-        print_error("record", error)
-        return 1
+        return print_policy_error("record", error, arguments)
 
 
 def _without_effect(parsed: argparse.Namespace) -> str:
