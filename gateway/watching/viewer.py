@@ -5,6 +5,7 @@ import contextlib
 import json
 import logging
 import time
+from collections.abc import AsyncGenerator
 from typing import Any, Literal, NamedTuple
 
 from daedalus.gateway.channel import HELLO_SECONDS, SEND_SECONDS, channel_of
@@ -12,7 +13,7 @@ from daedalus.gateway.client_messages import ClientError
 from daedalus.gateway.security import OPERATOR, Guard, RateLimit
 from daedalus.gateway.watching import page_data
 from daedalus.gateway.watching.page_data import Observation, PageData
-from daedalus.gateway.watching.person_matches import BeginMatch, Matches, MatchOrder, PlayMove, new_orders
+from daedalus.gateway.watching.person_matches import BeginMatch, MatchOrder, PlayMove, new_orders
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import Order
 
@@ -219,10 +220,9 @@ class ViewerConnection:
         text = await asyncio.to_thread(json.dumps, message, separators=(",", ":"), allow_nan=False)
         await self._send_event({"type": "websocket.send", "text": text})
 
-    async def _show_camera(self) -> None:
-        assert self._data.camera is not None
-        with contextlib.suppress(OSError):
-            async with contextlib.aclosing(self._data.camera.frames()) as frames:
+    async def _send_frames(self, source: AsyncGenerator[bytes, None]) -> None:
+        with contextlib.suppress(OSError):  # the page is closed
+            async with contextlib.aclosing(source) as frames:
                 async for frame in frames:
                     await self._send_event({"type": "websocket.send", "bytes": frame})
 
@@ -234,7 +234,7 @@ class ViewerConnection:
         place = contextlib.ExitStack()
         place.enter_context(matches.places.take(self._owner, self._end_match))
         self._orders = new_orders()
-        self._match = asyncio.create_task(self._play(matches, self._orders))
+        self._match = asyncio.create_task(self._send_frames(matches.play(self._orders)))
         self._match.add_done_callback(lambda _: place.close())
 
     def _end_match(self, reason: ClientError) -> None:
@@ -245,12 +245,6 @@ class ViewerConnection:
     async def _tell(self, reason: ClientError) -> None:
         with contextlib.suppress(OSError):  # the page is closed
             await self._send({"type": "refused", "reason": reason.reason})
-
-    async def _play(self, matches: Matches, orders: "asyncio.Queue[MatchOrder]") -> None:
-        with contextlib.suppress(OSError):  # the page is closed
-            async with contextlib.aclosing(matches.play(orders)) as frames:
-                async for frame in frames:
-                    await self._send_event({"type": "websocket.send", "bytes": frame})
 
     async def _finish(self, error: ClientError) -> None:
         """Say why the connection ends, and close it."""
@@ -299,7 +293,7 @@ class ViewerConnection:
                     self._camera.cancel()
                 self._camera = None
                 if on and self._data.camera is not None:
-                    self._camera = asyncio.create_task(self._show_camera())
+                    self._camera = asyncio.create_task(self._send_frames(self._data.camera.frames()))
             case BeginMatch() | PlayMove():
                 if self._match is None or self._match.done():
                     if isinstance(message, PlayMove):
