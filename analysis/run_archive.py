@@ -31,7 +31,7 @@ from daedalus.policy.saving.sealed import MANIFEST, DamagedError, SealedDirector
 from daedalus.policy.user_modules import module_of
 from daedalus.protocol.keys import is_name
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.texts import bounded_text, is_secret
+from daedalus.protocol.texts import bounded_text, is_secret, listed
 
 FORMAT = 1
 REPLAY = "replay"  # folder of a replay buffer (learner/training/replay_files.py, which needs torch)
@@ -194,7 +194,7 @@ def write_archive(directory: Path, output: Path, *, replay: bool = True) -> tupl
         except BaseException:
             output.unlink(missing_ok=True)
             raise
-        notes = [f"not in it, because no run has such a file: {listed(others)}"] if others else []
+        notes = [f"not in it, because no run has such a file: {listed_paths(others)}"] if others else []
         if buffer:
             size = sum(file.stat().st_size for file in buffer) / 2**20
             notes.append(
@@ -205,10 +205,9 @@ def write_archive(directory: Path, output: Path, *, replay: bool = True) -> tupl
         return written, [*notes, *_damaged(directory, kept, sha256), *_needed(directory)]
 
 
-def listed(paths: Sequence[str]) -> str:
+def listed_paths(paths: Sequence[str]) -> str:
     """Return the first of some paths, which somebody else may have chosen, in one line, and how many more there are."""
-    more = f" and {len(paths) - _MOST_NAMED:,} more" if len(paths) > _MOST_NAMED else ""
-    return f"{', '.join(bounded_text(path) for path in paths[:_MOST_NAMED])}{more}"
+    return listed([bounded_text(path) for path in paths], _MOST_NAMED)
 
 
 def _is_replay(file: Path, directory: Path) -> bool:

@@ -21,7 +21,7 @@ from daedalus.analysis.recorded_run import (
     read_run,
     read_run_settings,
 )
-from daedalus.analysis.run_archive import listed, module_names, parts_of
+from daedalus.analysis.run_archive import module_names, parts_of
 from daedalus.analysis.run_selection import Labels, read_labels
 from daedalus.learner.run.run_directory import VERSIONS, read_config, releases_of
 from daedalus.learner.run.run_files import RunDataError, read_json
@@ -237,7 +237,7 @@ def _why_kept(entry: RunEntry, *, is_best: bool, unfinished: bool) -> str:
         others = [name for name in parts_of(entry.directory)[1] if name not in _TRACKERS]
     except OSError as error:
         return f"it cannot be searched: {error.strerror}"
-    return f"it has files that are not of a run, such as {listed(others[:1])}" if others else ""
+    return f"it has files that are not of a run, such as {bounded_text(others[0])}" if others else ""
 
 
 def remove_run(directory: Path) -> None:

@@ -120,6 +120,12 @@ def bounded_text(text: str, most: int = MAX_TEXT) -> str:
     return " ".join(printable.split()).encode()[:most].decode(errors="ignore")
 
 
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
+
+
 def aligned(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:
     """Return the rows of a table as lines. `right` are the columns of numbers, counted from 0, which end flush."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -7,8 +7,8 @@ import gymnasium
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import MASK_KEY
-from daedalus.actor.environments.roles import listed
 from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.texts import listed
 
 _MOST_EMPTY_MATCHES = 100  # in a row, in which no agent with a seat has a part
 _MOST_IDLE_TURNS = 100_000  # of agents without a seat, between two turns of the seats

@@ -31,12 +31,13 @@ from daedalus.actor.environments.environment_errors import (
 from daedalus.actor.environments.game_copies import GameCopy, Outcome, game_copy, without_checks
 from daedalus.actor.environments.info import MASK_KEY, EpisodeInfo, info_to_keep, mask_of_one
 from daedalus.actor.environments.rendering import frame_rate, render_without_display
-from daedalus.actor.environments.roles import DifferentSpacesError, listed, roles_of
+from daedalus.actor.environments.roles import DifferentSpacesError, roles_of
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.actor.environments.wrappers import Camera
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
 from daedalus.protocol.spec import GAME_PACKAGES, EnvironmentSpec
+from daedalus.protocol.texts import listed
 
 _SHOWN = ("ansi", "rgb_array")  # render modes, the best first
 

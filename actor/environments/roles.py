@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.protocol.texts import listed
 
-_MOST_NAMES = 6  # of agents in a message
 _NUMBER = re.compile(r"_[0-9]+$")
 
 
@@ -25,12 +25,6 @@ class DifferentSpacesError(EnvironmentSetupError):
             f'choose one role, as in --set "environment.agents={first}"; the others then take random actions'
         )
         self.roles = dict(roles)
-
-
-def listed(agents: Sequence[str]) -> str:
-    """Return the names of agents in one short line."""
-    more = len(agents) - _MOST_NAMES
-    return ", ".join(agents[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def role_of(agent: str) -> str:

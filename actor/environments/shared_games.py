@@ -15,10 +15,11 @@ import numpy as np
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.game_copies import GameCopy, Outcome
 from daedalus.actor.environments.games import GameEnvironments, close_copies, make_copies
-from daedalus.actor.environments.roles import agents_named, listed
+from daedalus.actor.environments.roles import agents_named
 from daedalus.actor.environments.vector_environments import BackendStep
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import ActorSpec, EnvironmentSpec
+from daedalus.protocol.texts import listed
 
 _WAIT_SECONDS = 0.1  # between two calls of `on_wait`
 _MADE_FROM = ("id", "backend", "kwargs", "training_kwargs")  # settings that decide which game is made

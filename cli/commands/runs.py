@@ -173,13 +173,13 @@ def _mib(size: int) -> str:
 
 def _show(parsed: argparse.Namespace) -> int:
     if parsed.path.is_file():
-        from daedalus.analysis.run_archive import listed, read_archive
+        from daedalus.analysis.run_archive import listed_paths, read_archive
 
         archive = read_archive(parsed.path)
         archive.verify()
         say(f"{_described(parsed.path, archive)}; all checksums are right")
         if archive.left_out:
-            say(f"  not in it: {listed(archive.left_out)}")
+            say(f"  not in it: {listed_paths(archive.left_out)}")
         say(f"  restore it with: {shlex.join(['daedalus', 'runs', 'restore', str(parsed.path)])}")
         return 0
     from daedalus.analysis.run_folder import described, read_entry

@@ -25,6 +25,7 @@ from daedalus.protocol.league import NEWEST, LeagueStatus
 from daedalus.protocol.messages import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import (
     aligned,
+    listed,
     one_line,
     policy_lag,
     printable,
@@ -261,9 +262,8 @@ def _waiting(names: Sequence[str]) -> str:
     """Return which actors wait for a run, as the end of a sentence."""
     if not names:
         return ""
-    more = f" and {len(names) - _MOST_WAITING:,} more" if len(names) > _MOST_WAITING else ""
     actors = "1 actor waits" if len(names) == 1 else f"{len(names):,} actors wait"
-    return f"; {actors} for a run: {', '.join(names[:_MOST_WAITING])}{more}"
+    return f"; {actors} for a run: {listed(names, _MOST_WAITING)}"
 
 
 def _text(shown: RunStatus | EventsPage) -> str:

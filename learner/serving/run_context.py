@@ -19,6 +19,7 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import new_epoch
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import listed
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -98,15 +99,12 @@ class Health:
         elif self.is_stalled(now, expected):
             found.append(f"no update for {now - self.updated:.0f} s")
         if self.left_out:
-            names = sorted(self.left_out)
-            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            who = f"{', '.join(names[:5])}{more}"
+            who = listed(sorted(self.left_out), 5)
             found.append(f"batches do not wait for {who}: connected, but far slower than the others, or hung")
         far = {name: each for name, (each, last) in self.far_outside.items() if now - last < _FAR_SECONDS}
         if far:
             names = [f"{name} ({component})" for name, component in sorted(far.items())]
-            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            found.append(f"rollouts with numbers far outside those of other actors: {', '.join(names[:5])}{more}")
+            found.append(f"rollouts with numbers far outside those of other actors: {listed(names, 5)}")
         if self.gradient_fault:
             found.append("updates are skipped: the gradient is not finite")
         if self.save_fault:
