@@ -320,8 +320,6 @@ def bounded(origin: Origin) -> Origin:
     )
 
 
-__all__ = ["Actor", "Fleet"]
-
 _MAX_ACTORS = 16_384
 # Environments that an actor may state: the larger of a number and a multiple of what the run expects.
 _FEW_ENVIRONMENTS, _TIMES_EXPECTED = 256, 8
