@@ -242,15 +242,15 @@ def _play(
 
 
 def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation, actions: str) -> dict[str, Any]:
-    note = _note(evaluation, policy.spec.evaluation.max_episode_env_steps, sampled=actions == "sampled")
+    note = _note(spec, evaluation, policy.spec.evaluation.max_episode_env_steps, sampled=actions == "sampled")
     returns, lengths, notes = evaluation.returns, evaluation.lengths, [note] if note else []
     result = evaluation_result(policy.directory, policy.policy_version, spec, returns, lengths, notes)
     return {**result, "returns": returns.tolist(), "lengths": lengths.tolist()}
 
 
-def _note(evaluation: Evaluation, longest: int, *, sampled: bool) -> str:
+def _note(spec: EnvironmentSpec, evaluation: Evaluation, longest: int, *, sampled: bool) -> str:
     """Return a message about episodes that were cut, or an empty string."""
     cut = int((evaluation.cut & (evaluation.lengths == longest)).sum())
     if cut:
-        return cut_note(cut, len(evaluation.cut), longest, sampled=sampled)
+        return cut_note(spec, cut, len(evaluation.cut), longest, sampled=sampled)
     return "the last episode was cut at the end of the video" if evaluation.cut.any() else ""

@@ -159,6 +159,12 @@ class EnvironmentSpec(Specification):
         return self.backend == "pettingzoo"
 
     @property
+    def remedy_of_endless(self) -> str:
+        """What to do about episodes that do not end."""
+        remedy = "truncate its agents in the game" if self.is_game else "set environment.max_episode_steps"
+        return f"if the environment never ends them, {remedy}"
+
+    @property
     def constructor_kwargs(self) -> dict[str, JsonValue]:
         """Arguments of an environment's constructor: `kwargs` and `training_kwargs`.
 

@@ -248,10 +248,8 @@ def never_ends(report: EnvironmentReport, spec: RunSpec) -> str:
     """Return advice if no episode ended and nothing limits episodes, else an empty string."""
     if report.lengths or report.time_limit is not None or spec.environment.max_episode_steps is not None:
         return ""
-    return (
-        f"no episode ended within {report.env_steps:,} env_steps of random actions: "
-        "if the environment never ends them, set environment.max_episode_steps"
-    )
+    remedy = spec.environment.remedy_of_endless
+    return f"no episode ended within {report.env_steps:,} env_steps of random actions: {remedy}"
 
 
 def _duration(seconds: float) -> str:

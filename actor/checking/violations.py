@@ -111,7 +111,7 @@ def step_violations(space: gymnasium.Space, result: Any) -> Iterator[Violation]:
         return
     observation, reward, terminated, truncated, info = result
     yield from observation_violations(space, observation, "step")
-    yield from _reward_violations(reward)
+    yield from reward_violations(reward)
     for name, flag in (("terminated", terminated), ("truncated", truncated)):
         if not isinstance(flag, bool | np.bool_):
             yield "warning", f"step returns {name}={_shown(flag)}, of type {type(flag).__name__}: it must be a bool"
@@ -119,7 +119,8 @@ def step_violations(space: gymnasium.Space, result: Any) -> Iterator[Violation]:
         yield "problem", f"step returns info of type {type(info).__name__}: it must be a dict"
 
 
-def _reward_violations(reward: Any) -> Iterator[Violation]:
+def reward_violations(reward: Any) -> Iterator[Violation]:
+    """Yield what is wrong with a reward."""
     try:
         number = float(reward)
     except (TypeError, ValueError):

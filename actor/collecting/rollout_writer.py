@@ -514,13 +514,6 @@ class SeatWriter(RolloutWriter):
         assert observed.over is not None
         began = self._over & ~observed.over
         if np.count_nonzero(began):
-            columns = self._lineup.column[np.repeat(began, self._seats)]
-            columns = columns[columns >= 0]
-            if (self._writing[columns] & ~self._resets[columns]).any():
-                raise EnvironmentSetupError(
-                    "a match of the game ended, and an agent that acted in it saw no end: each agent must have a last "
-                    "observation with its termination or truncation"
-                )
             self._lineup.seat(np.flatnonzero(began).tolist())
         self._over = observed.over
 

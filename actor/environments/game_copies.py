@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.texts import listed
@@ -16,6 +16,7 @@ _MOST_IDLE_TURNS = 100_000  # of agents without a seat, between two turns of the
 _OF_ALL = "__all__"  # an entry that environments for RLlib have beside those of the agents
 
 OtherAction = Callable[[str, Any, Any], Any]  # of an agent without a seat, for its observation and info
+LostReward = Callable[[str, float], None]  # notes the reward of an agent with a seat that has left
 
 
 class Outcome(NamedTuple):
@@ -51,11 +52,11 @@ class GameCopy(Protocol):
         ...
 
 
-def game_copy(environment: Any, seats: Sequence[str], others: OtherAction) -> GameCopy:
+def game_copy(environment: Any, seats: Sequence[str], others: OtherAction, lost_reward: LostReward) -> GameCopy:
     """Return a copy of a game as one of these, for a PettingZoo environment."""
     if hasattr(environment, "agent_iter"):
         return _TurnGame(environment, seats, others)
-    return _SimultaneousGame(environment, seats, others)
+    return _SimultaneousGame(environment, seats, others, lost_reward)
 
 
 def without_checks(environment: Any, spec: EnvironmentSpec) -> Any:
@@ -93,12 +94,14 @@ class _TurnGame:
     def __init__(self, environment: Any, agents: Sequence[str], others: OtherAction) -> None:
         self._environment, self._agents, self._others = environment, frozenset(agents), others
         self._turn: str | None = None  # the agent of ours that must act
+        self._playing = set[str]()  # the agents of ours that have acted, and whose end is still to come
 
     def reset(self, seed: int | None) -> list[Outcome]:
         """See GameCopy."""
         for _ in range(_MOST_EMPTY_MATCHES):
             self._environment.reset(seed=seed)
             self._turn = None
+            self._playing.clear()
             if outcomes := self._advance():
                 return outcomes
             seed = None  # no agent with a seat had a part in the match: the next one
@@ -112,7 +115,9 @@ class _TurnGame:
     def step(self, actions: Mapping[str, Any]) -> list[Outcome]:
         """See GameCopy."""
         if self._turn is not None:
-            action, self._turn = actions[self._turn], None
+            action = actions[self._turn]
+            self._playing.add(self._turn)
+            self._turn = None
             self._environment.step(action)
         return self._advance()
 
@@ -126,6 +131,8 @@ class _TurnGame:
         environment, outcomes = self._environment, dict[str, Outcome]()
         for _ in range(_MOST_IDLE_TURNS):
             if not environment.agents:
+                if self._playing:
+                    raise _without_end(min(self._playing))
                 return list(outcomes.values())
             agent = environment.agent_selection
             if agent in outcomes:  # the next call passes it on
@@ -133,11 +140,15 @@ class _TurnGame:
             observation, reward, terminated, truncated, info = environment.last()
             ended = bool(terminated or truncated)
             if agent in self._agents:
-                outcomes[agent] = Outcome(agent, observation, float(reward), bool(terminated), bool(truncated), info)
+                number = _number(agent, reward)
+                outcomes[agent] = Outcome(agent, observation, number, bool(terminated), bool(truncated), info)
                 if not ended:
                     self._turn = agent
                     return list(outcomes.values())
+                self._playing.discard(agent)
             environment.step(None if ended else self._others(agent, observation, info))
+            if ended and agent in environment.agents:
+                raise _stays(agent, "step(None)", "call _was_dead_step(action) there and return")
         raise _idle()
 
 
@@ -149,11 +160,30 @@ def _idle() -> EnvironmentSetupError:
     return EnvironmentSetupError(f"no agent of the policy had a turn in {_MOST_IDLE_TURNS:,} turns of the others")
 
 
+def _stays(agent: str, call: str, remedy: str) -> EnvironmentSetupError:
+    return EnvironmentSetupError(f"{agent} has ended, but is still in its `agents` after {call}: {remedy}")
+
+
+def _without_end(agent: str) -> EnvironmentSetupError:
+    return EnvironmentSetupError(
+        f"{agent} has left its `agents` without an end: each agent must have a last observation with its "
+        "termination or truncation"
+    )
+
+
+def _number(agent: str, reward: Any) -> float:
+    try:
+        return float(reward)
+    except (TypeError, ValueError):
+        raise EnvironmentSetupError(f"{agent} has the reward {described(reward)}: it must be a number") from None
+
+
 class _SimultaneousGame:
     """A game whose agents act together (PettingZoo's parallel interface)."""
 
-    def __init__(self, environment: Any, agents: Sequence[str], others: OtherAction) -> None:
+    def __init__(self, environment: Any, agents: Sequence[str], others: OtherAction, lost_reward: LostReward) -> None:
         self._environment, self._agents, self._others = _in_rounds(environment), frozenset(agents), others
+        self._lost_reward = lost_reward
         self._possible = dict.fromkeys(environment.possible_agents)
         self._seen: dict[str, tuple[Any, Any]] = {}  # newest observation and info of the agents that are not ours
 
@@ -189,7 +219,19 @@ class _SimultaneousGame:
         observations, rewards, terminated, truncated, infos = self._environment.step(chosen)
         self._refuse_others({"rewards": rewards, "terminations": terminated, "truncations": truncated})
         came = [agent for agent in self._environment.agents if agent not in before]
-        return self._outcomes((*before, *came), observations, rewards, terminated, truncated, infos)
+        outcomes = self._outcomes((*before, *came), observations, rewards, terminated, truncated, infos)
+        here = set(self._environment.agents)
+        over = terminated.get(_OF_ALL) or truncated.get(_OF_ALL)
+        for agent, _, _, ended, cut, _ in outcomes:
+            if (ended or cut or over) and agent in here:
+                raise _stays(agent, "its last step", "remove it there")
+            if not (ended or cut or agent in here):
+                raise _without_end(agent)
+        if len(rewards) > len(outcomes):
+            for agent in self._agents.intersection(rewards).difference(before, came):
+                if reward := _number(agent, rewards[agent]):
+                    self._lost_reward(agent, reward)
+        return outcomes
 
     def _refuse_others(self, results: Mapping[str, Mapping[str, Any]]) -> None:
         """Raise EnvironmentSetupError for a result of nobody: what an agent has no entry in is 0 or False for it."""
@@ -229,7 +271,7 @@ class _SimultaneousGame:
             Outcome(
                 agent,
                 observations[agent],
-                float(rewards.get(agent, 0.0)),
+                _number(agent, rewards.get(agent, 0.0)),
                 bool(terminated.get(agent, False)),
                 bool(truncated.get(agent, False)),
                 infos.get(agent, {}),

@@ -81,7 +81,7 @@ class GameEnvironments:
         self.infos: list[Any] = [{}] * self.count  # the newest `info` of each seat, as the game gives it
         self._ended = np.zeros(self.count, np.bool_)
         self._acts = np.zeros(self.count, np.bool_)  # whether the seat has acted in this match
-        self._warned = False
+        self._warned = set[str]()  # of which rewards
         self.resting = np.zeros(len(copies), np.bool_)  # copies that do not begin another match
         self._abandoned = np.zeros(len(copies), np.bool_)  # copies whose match goes on, but not here
         self.openings = 0  # see LeagueSpec
@@ -95,7 +95,7 @@ class GameEnvironments:
     def copies_for(self, agents: Sequence[str]) -> list[GameCopy]:
         """Return each copy as a game in which these agents have seats; the others take random legal actions."""
         return [
-            game_copy(environment, agents, partial(self._random_action, number))
+            game_copy(environment, agents, partial(self._random_action, number), self._warn_of_lost_reward)
             for number, environment in enumerate(self._environments)
         ]
 
@@ -203,7 +203,11 @@ class GameEnvironments:
             if self._in_match[seat] is not None:
                 self._newest[seat] = outcome.observation, mask_of(outcome.observation, outcome.info)
             if not self._acts[seat] and outcome.reward:
-                self._warn_of_reward(outcome)
+                self._warn_of_reward(
+                    "early",
+                    f"{outcome.agent} has the reward {outcome.reward:g} before its first action of a match: such "
+                    "rewards count in results of matches, and are not learned from",
+                )
             self._ended[seat] = outcome.terminated or outcome.truncated
             if self._ended[seat]:
                 self._acts[seat] = False
@@ -256,16 +260,17 @@ class GameEnvironments:
             )
         self.action_mask[seat] = rows[0]
 
-    def _warn_of_reward(self, outcome: Outcome) -> None:
-        if not self._warned:
-            self._warned = True
-            _logger.warning(
-                "environment %s: %s has the reward %g before its first action of a match: such rewards count in "
-                "results of matches, and are not learned from",
-                self.name,
-                outcome.agent,
-                outcome.reward,
-            )
+    def _warn_of_lost_reward(self, agent: str, reward: float) -> None:
+        self._warn_of_reward(
+            "late",
+            f"{agent} has the reward {reward:g} after it has left the match: such rewards count nowhere; let it stay, "
+            "or give them with its last step",
+        )
+
+    def _warn_of_reward(self, kind: str, text: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
+            _logger.warning("environment %s: %s", self.name, text)
 
     def _random_action(self, number: int, agent: str, observation: Any, info: Any) -> Any:
         """Return a legal action of an agent without a seat."""

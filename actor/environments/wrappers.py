@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.checking.violations import observation_violations, reward_violations
 from daedalus.actor.environments.components import dtype_misfit, leaves, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import MASK_KEY
@@ -18,6 +18,7 @@ from daedalus.policy.user_modules import USER_STATE
 
 Camera = Callable[[np.ndarray, FrameRate], None]
 
+_NUMBERS = (float, int, np.number, np.bool_)
 _ARRAYS = (gym.Box, gym.Discrete, gym.MultiDiscrete, gym.MultiBinary)
 
 
@@ -54,7 +55,8 @@ class OfItsSpace(gymnasium.Wrapper):
     """A wrapper that refuses an observation which would be another one in a batch with those of other environments.
 
     To copy it there, gymnasium converts an integer that is too large for the dtype of the space to another number, and
-    its shared memory takes other shapes and fractions, too.
+    its shared memory takes other shapes and fractions, too. A reward that is no number is refused, too: what a batch
+    makes of it depends on environment.processes.
     """
 
     def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str] = ()) -> None:
@@ -81,6 +83,9 @@ class OfItsSpace(gymnasium.Wrapper):
         else:
             result = self.env.step(action)
         self._check("step", result[0])
+        if not isinstance(result[1], _NUMBERS):
+            for _, text in reward_violations(result[1]):
+                raise EnvironmentSetupError(f"environment {self._name}: {text}")
         return result
 
     def _check(self, call: str, observation: Any) -> None:

@@ -144,12 +144,12 @@ def environments_for(episodes: int, spec: EnvironmentSpec, collection: Collectio
     return min(episodes, most)
 
 
-def cut_note(cut: int, episodes: int, longest: int, *, sampled: bool) -> str:
+def cut_note(spec: EnvironmentSpec, cut: int, episodes: int, longest: int, *, sampled: bool) -> str:
     """Return a message about the episodes of an evaluation that were cut."""
     greedy = "" if sampled else "greedy actions may go in circles where sampled ones do not (--actions sampled); "
     return (
         f"{cut} of {episodes} episodes were cut after {longest:,} env_steps (evaluation.max_episode_env_steps): "
-        f"{greedy}if the environment never ends them, set environment.max_episode_steps"
+        f"{greedy}{spec.remedy_of_endless}"
     )
 
 

@@ -180,7 +180,8 @@ class Evaluator:
         _logger.info("policy version %d: return %s", snapshot.policy_version, short_number(evaluation.returns.mean()))
         note = ""
         if evaluation.cut.any():
-            note = cut_note(int(evaluation.cut.sum()), wanted.episodes, longest, sampled=sampled)
+            cut = int(evaluation.cut.sum())
+            note = cut_note(welcome.spec.environment, cut, wanted.episodes, longest, sampled=sampled)
             if not (self._warned_of_cuts or welcome.play_episodes):  # whoever asked at once shows the note
                 self._warned_of_cuts = True
                 _logger.warning("%s", note)

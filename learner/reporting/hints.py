@@ -146,9 +146,9 @@ _LONG_EPISODE, _USUAL_EPISODE = 10_000, 2_000
 class EpisodeHint:
     """Hint that no episode has ended after many steps, or after half of a small budget; given once."""
 
-    def __init__(self, budget: int) -> None:
-        """`budget` is in env_steps."""
-        self._budget, self._given = budget, False
+    def __init__(self, budget: int, remedy: str) -> None:
+        """Construct from the budget in env_steps, and what to do about episodes that do not end."""
+        self._budget, self._remedy, self._given = budget, remedy, False
 
     def take(self, counters: RunCounters, fleet: Fleet) -> str:
         """Return the hint if it is due, else an empty string."""
@@ -157,10 +157,7 @@ class EpisodeHint:
         if self._given or counters.episodes or counters.env_steps < environments * length:
             return ""
         self._given = True
-        return (
-            f"no episode has ended after {length:,} env_steps in each environment: "
-            "if the environment never ends them, set environment.max_episode_steps"
-        )
+        return f"no episode has ended after {length:,} env_steps in each environment: {self._remedy}"
 
 
 _STRAGGLES = 1.5  # times the median of the others' durations

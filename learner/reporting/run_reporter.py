@@ -67,7 +67,7 @@ class RunReporter:
         self._meter = RateMeter(self._counters, context.health.started)
         self._bottleneck = ""  # at the newest row
         self._usage = UsageMeter()
-        self._episode_hint = EpisodeHint(training.env_steps)
+        self._episode_hint = EpisodeHint(training.env_steps, context.spec.environment.remedy_of_endless)
         self._learning_hint = LearningHint(training)
         self._observation_hint = ObservationHint()
 

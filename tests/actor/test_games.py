@@ -414,10 +414,18 @@ class Duel(ParallelEnv):
         self.left -= 1
         here, over = self.agents, self.left <= 0 and (self.problem != "endless" or actions["red"] == 1)
         rewards = {agent: float(actions[agent]) if self.problem != "reward" else np.nan for agent in here}
-        self.agents = [] if over else here
+        self.agents = here if not over or self.problem.endswith("stays") else []
+        terminated = dict.fromkeys(here, over and self.problem not in ("no end", "all, stays"))
         if self.problem == "other agent":
             rewards = {"Red": 1.0, "__all__": 1.0}
-        return self._seen(), rewards, dict.fromkeys(here, over), dict.fromkeys(here, False), self._info()
+        if self.problem == "reward in a list":
+            rewards["blue"] = [1.0]
+        if self.problem == "all, stays":
+            terminated["__all__"] = over
+        if self.problem == "late reward":
+            terminated["blue"], self.agents = True, [each for each in self.agents if each != "blue"]
+            rewards["blue"] = 2.0 if over else 0.0
+        return self._seen(), rewards, terminated, dict.fromkeys(here, False), self._info()
 
     def _seen(self) -> dict[str, np.ndarray]:
         more = 2 if self.problem == "shape" and self.left < 5 else 0
@@ -550,7 +558,8 @@ class Alternate(AECEnv):
     def step(self, action: Any) -> None:
         agent, other = self.agent_selection, {"red": "blue", "blue": "red"}[self.agent_selection]
         if self.terminations[agent]:
-            self._was_dead_step(action)
+            if self.fault != "stays":
+                self._was_dead_step(action)
             return
         if self.fault != "not set to 0":
             self._cumulative_rewards[agent] = 0
@@ -558,6 +567,8 @@ class Alternate(AECEnv):
         self.terminations = dict.fromkeys(self.agents, self.turn >= 6)
         if self.fault != "not accumulated":
             self._accumulate_rewards()
+        if self.fault == "no end" and self.turn >= 6:
+            self.agents = []
 
 
 @pytest.mark.parametrize(("fault", "received"), [("", ""), ("not set to 0", "-12"), ("not accumulated", "0")])
@@ -567,6 +578,19 @@ def test_rewards_of_a_game_in_turns_that_its_agents_do_not_get_are_a_warning(fau
     assert report.problems == ()
     text = f"`rewards` of red in a match add up to -6, but it gets {received} by `last`"
     assert [text in each for each in report.warnings] == [True] * bool(fault)
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        ("stays", "red has ended, but is still in its `agents` after step(None): call _was_dead_step(action) there"),
+        ("no end", "blue has left its `agents` without an end"),
+    ],
+)
+def test_ends_of_a_game_in_turns_that_are_none_are_named(fault: str, text: str) -> None:
+    spec = EnvironmentSpec(id="test_games:Alternate", backend="pettingzoo", kwargs={"fault": fault})
+    (found,) = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20).problems
+    assert text in found
 
 
 class Numbers(Board):
@@ -643,6 +667,10 @@ def test_a_game_is_checked() -> None:
             "its rewards have an entry for 'Red', which is no agent: its possible_agents are red, blue",
         ),
         ("no choice", {}, "forbids every choice"),
+        ("stays", {}, "red has ended, but is still in its `agents` after its last step: remove it there"),
+        ("all, stays", {}, "red has ended, but is still in its `agents`"),
+        ("no end", {}, "red has left its `agents` without an end"),
+        ("reward in a list", {}, r"blue has the reward \[1.0\]: it must be a number"),
         ("reward", {}, "red has the reward nan: it must be finite"),
         ("raises", {}, "step raises RuntimeError: the table broke"),
     ],
@@ -651,6 +679,11 @@ def test_faults_of_games_are_named(problem: str, fields: dict[str, Any], text: s
     (found,) = make(problem, **fields).problems
     assert re.search(text, found), found
     assert "\n" not in found
+
+
+def test_a_reward_of_an_agent_that_has_left_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    assert set(make("late reward").returns) == {2.5}
+    assert "blue has the reward 2 after it has left the match: such rewards count nowhere" in caplog.messages[0]
 
 
 def test_the_backend_of_a_game_of_one_s_own_is_suggested() -> None:

@@ -640,6 +640,12 @@ def test_exception_of_an_environment_is_reported_with_its_place(
         _play(processes, **settings)
 
 
+@pytest.mark.parametrize("processes", [False, True])
+def test_reward_that_is_no_number_is_refused(processes: bool) -> None:
+    with pytest.raises(EnvironmentSetupError, match=r"Faulty-v0: step returns the reward \[1.0\]: it must be a number"):
+        _play(processes, kwargs={"fault": "reward in a list"})
+
+
 def test_traceback_of_the_users_code_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(EnvironmentSetupError):
         _play(False, kwargs={"fault": "error in a function"})

@@ -76,25 +76,26 @@ def test_rates_before_the_first_batch_and_after_the_last_are_unknown_and_nothing
 
 
 def test_a_run_without_the_end_of_an_episode_gets_a_hint_once() -> None:
-    counters, fleet, hint = RunCounters(100), joined_fleet("a", "b"), EpisodeHint(10**6)  # six environments
+    counters, fleet, hint = (
+        RunCounters(100),
+        joined_fleet("a", "b"),
+        EpisodeHint(10**6, "limit them"),
+    )  # six environments
     counters.env_steps = 59_999
     assert hint.take(counters, fleet) == ""
     counters.env_steps = 60_000
-    assert hint.take(counters, fleet) == (
-        "no episode has ended after 10,000 env_steps in each environment: if the environment never ends them, "
-        "set environment.max_episode_steps"
-    )
+    assert hint.take(counters, fleet) == ("no episode has ended after 10,000 env_steps in each environment: limit them")
     assert hint.take(counters, fleet) == ""
-    assert EpisodeHint(10**6).take(trained_counters(1.0), fleet) == ""
+    assert EpisodeHint(10**6, "").take(trained_counters(1.0), fleet) == ""
     ended = trained_counters(1.0)
     ended.env_steps = 10**9
-    assert EpisodeHint(10**6).take(ended, fleet) == ""
+    assert EpisodeHint(10**6, "").take(ended, fleet) == ""
 
 
 def test_the_hint_comes_after_half_of_a_small_budget() -> None:
     counters, fleet = RunCounters(100), joined_fleet("a", "b")
     for budget, due, length in ((60_000, 30_000, "5,000"), (12_000, 12_000, "2,000")):
-        hint = EpisodeHint(budget)
+        hint = EpisodeHint(budget, "")
         counters.env_steps = due - 1
         assert hint.take(counters, fleet) == ""
         counters.env_steps = due
