@@ -93,10 +93,11 @@ def environment_object(env: object) -> EnvironmentObject:
         return EnvironmentObject(id=_own_id(name), maker=OneInstance(env), is_instance=True)
     if isinstance(env, VectorEnv) or (isinstance(env, type) and issubclass(env, VectorEnv)):
         raise TypeError(f"env is {env}, several environments in one: pass the class or function of a single one")
-    if not callable(env) or (isinstance(env, type) and not issubclass(env, gymnasium.Env)):
+    if not callable(env) or (isinstance(env, type) and not hasattr(env, "step")):
         raise TypeError(
             'env must be the id of a registered environment, such as "CartPole-v1", or a gymnasium.Env: its class, a '
-            f"function that returns one, or an instance; not {env}"
+            f"function that returns one, or an instance; not {env}. Of a game of PettingZoo's pass the class, or a "
+            "function of a module that returns one, with settings={'environment.backend': 'pettingzoo'}"
         )
     if (importable := _entry_point(env)) is not None:
         return EnvironmentObject(id=importable)

@@ -147,6 +147,11 @@ class EnvironmentSpec(Specification):
         names = ("agents", "agent_ids")
         if self.is_game:
             names = ("wrap", "processes", "max_episode_steps", "action_repeat", "no_reward_limit")
+            if self.is_from_python:
+                raise ValueError(
+                    f"environment.backend=pettingzoo needs a game of a module, and no module has {self.id}: move it to "
+                    "a module, a file of its own, and pass its class or function"
+                )
         for name in names:
             if getattr(self, name) != type(self).model_fields[name].default:
                 kind = "is for games with several agents" if not self.is_game else "does not apply to games"

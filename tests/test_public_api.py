@@ -156,6 +156,10 @@ def test_a_resumed_run_that_fails_keeps_its_files(tmp_path: Path, monkeypatch: p
             {"preset": "cartpole", "settings": {"environment.no_reward_limit": 9}},
             "training.target_return is 475, but training plays another task",
         ),
+        (
+            {"env": lambda: None, "settings": {"environment.backend": "pettingzoo"}},
+            "setting environment environment.backend=pettingzoo needs a game of a module, and no module has ",
+        ),
         ({"preset": "cartpole", "log": "tensorboard"}, "log: unknown tracker 'tensorboard': choose from wandb, mlflow"),
         ({"preset": "cartpole", "log": ["wandb", "x"]}, "log: unknown tracker 'x'"),
         (
