@@ -120,10 +120,10 @@ def bounded_text(text: str, most: int = MAX_TEXT) -> str:
     return " ".join(printable.split()).encode()[:most].decode(errors="ignore")
 
 
-def listed(names: Sequence[str], most: int = 6) -> str:
+def listed(names: Sequence[object], most: int = 6) -> str:
     """Return the first names, and how many more there are."""
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
-    return f"{', '.join(names[:most])}{more}"
+    return ", ".join(map(str, names[:most])) + more
 
 
 def aligned(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:

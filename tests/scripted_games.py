@@ -2,7 +2,7 @@
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -170,11 +170,21 @@ class Turns(Scripted, AECEnv):
         self._deads_step_first()
 
 
+class Seat(NamedTuple):
+    """An agent that is no text."""
+
+    number: int
+
+    def __str__(self) -> str:
+        return f"agent_{self.number}"
+
+
 class Together(Scripted, ParallelEnv):
     """The game with all agents at once."""
 
     def __init__(self, seed: int, agents: int) -> None:
         super().__init__(seed, agents, together=True)
+        self.possible_agents: list[Any] = [Seat(number) for number in range(agents)]
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Any:
         self.begin()

@@ -94,7 +94,7 @@ class _TurnGame:
     def __init__(self, environment: Any, agents: Sequence[str], others: OtherAction) -> None:
         self._environment, self._agents, self._others = environment, frozenset(agents), others
         self._turn: str | None = None  # the agent of ours that must act
-        self._playing = set[str]()  # the agents of ours that have acted, and whose end is still to come
+        self._playing = dict[str, None]()  # the agents of ours that have acted, and whose end is still to come
 
     def reset(self, seed: int | None) -> list[Outcome]:
         """See GameCopy."""
@@ -116,7 +116,7 @@ class _TurnGame:
         """See GameCopy."""
         if self._turn is not None:
             action = actions[self._turn]
-            self._playing.add(self._turn)
+            self._playing[self._turn] = None
             self._turn = None
             self._environment.step(action)
         return self._advance()
@@ -132,7 +132,7 @@ class _TurnGame:
         for _ in range(_MOST_IDLE_TURNS):
             if not environment.agents:
                 if self._playing:
-                    raise _without_end(min(self._playing))
+                    raise _without_end(next(iter(self._playing)))
                 return list(outcomes.values())
             agent = environment.agent_selection
             if agent in outcomes:  # the next call passes it on
@@ -145,7 +145,7 @@ class _TurnGame:
                 if not ended:
                     self._turn = agent
                     return list(outcomes.values())
-                self._playing.discard(agent)
+                self._playing.pop(agent, None)
             environment.step(None if ended else self._others(agent, observation, info))
             if ended and agent in environment.agents:
                 raise _stays(agent, "step(None)", "call _was_dead_step(action) there and return")

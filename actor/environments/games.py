@@ -47,18 +47,19 @@ _logger = logging.getLogger(__name__)
 class GameEnvironments:
     """A BackendEnvironments of E seats: those of each copy of a game side by side, copy after copy."""
 
-    def __init__(self, name: str, copies: Sequence[Any], spec: EnvironmentSpec, seats: tuple[str, ...]) -> None:
+    def __init__(self, name: str, copies: Sequence[Any], spec: EnvironmentSpec, seats: tuple[Any, ...]) -> None:
         """Construct from PettingZoo environments, and reset them: only a reset shows whether there are masks.
 
         Args:
           name: id of the game, for errors.
           copies: the environments, of one kind.
           spec: which components are left out, and whether the observation names the agent.
-          seats: the agents that have seats. The others take random legal actions.
+          seats: the agents that have seats. The others take random legal actions. An agent may be any object, such as a
+            number; its name is then the text of it.
 
         Raises EnvironmentSetupError.
         """
-        self.name, self.agents = name, seats
+        self.name, self.agents = name, tuple(map(str, seats))
         self._environments = [without_checks(environment, spec) for environment in copies]
         self.seats = len(seats)
         self.count = len(copies) * len(seats)
@@ -354,7 +355,7 @@ def make_games(
     make = _make_shown if shown else _make
     if render_mode is not None:
         make = partial(_make_rendered, mode=render_mode)
-    copies = make_copies(spec, count, modules, lambda game: further(_seats(game, spec)), make)
+    copies = make_copies(spec, count, modules, lambda game: further(tuple(map(str, _seats(game, spec)))), make)
     try:
         return GameEnvironments(spec.id, copies, spec, _seats(copies[0], spec))
     except BaseException:
@@ -467,9 +468,15 @@ def _module(name: str) -> Any:
         ) from None
 
 
-def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
+def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[Any, ...]:
     """Return the agents that the policy plays. Raises EnvironmentSetupError if their spaces differ."""
-    possible = tuple(environment.possible_agents)
+    agents = {str(agent): agent for agent in environment.possible_agents}
+    possible = tuple(agents)
+    if not possible or len(possible) < len(environment.possible_agents):
+        raise EnvironmentSetupError(
+            f"environment {spec.id}: its possible_agents are {environment.possible_agents!r}: name at least one agent, "
+            "and each by another name"
+        )
     unknown = [agent for agent in spec.agents if agent not in possible]
     if unknown:
         raise EnvironmentSetupError(
@@ -478,8 +485,8 @@ def _seats(environment: Any, spec: EnvironmentSpec) -> tuple[str, ...]:
     chosen = tuple(agent for agent in possible if agent in spec.agents) or possible
     groups: dict[str, list[str]] = {}
     for agent in chosen:
-        spaces = f"{environment.observation_space(agent)} {environment.action_space(agent)}"
+        spaces = f"{environment.observation_space(agents[agent])} {environment.action_space(agents[agent])}"
         groups.setdefault(spaces, []).append(agent)
     if len(groups) > 1:
         raise DifferentSpacesError(spec.id, roles_of(list(groups.values()), possible))
-    return chosen
+    return tuple(agents[agent] for agent in chosen)

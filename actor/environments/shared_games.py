@@ -110,7 +110,7 @@ class RoleEnvironments(GameEnvironments):
             self._begins = True
             return super().reset(seed)
         copies = self._shared.begin(self._run, seed, self.on_wait)
-        self._games = [_SeatsOfCopy(copy, self._run, self.agents) for copy in copies]
+        self._games = [_SeatsOfCopy(copy, self._run, [*self._numbers]) for copy in copies]
         with self._shared.playing():
             return super().reset(seed)
 
@@ -211,7 +211,10 @@ class SharedGames:
 
     def _divided(self, possible: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
         """Return the agents of each run."""
-        agents = {run: agents_named(names, possible) for run, names in self._seats.items()}
+        named = {str(agent): agent for agent in possible}
+        agents = {
+            run: tuple(named[name] for name in agents_named(names, tuple(named))) for run, names in self._seats.items()
+        }
         taken: dict[str, str] = {}
         for run, own in agents.items():
             for agent in own:
@@ -224,8 +227,8 @@ class SharedGames:
 
     def _check_agents(self, run: str, spec: EnvironmentSpec) -> None:
         possible = tuple(self.environments[0].possible_agents)
-        own, wanted = self._agents[run], tuple(agent for agent in possible if agent in spec.agents) or possible
-        if own != wanted or set(spec.agents) - set(possible):
+        own, wanted = self._agents[run], tuple(agent for agent in possible if str(agent) in spec.agents) or possible
+        if own != wanted or set(spec.agents) - set(map(str, possible)):
             raise EnvironmentSetupError(
                 f"--seat gives {listed(own)} to the run {run!r}, whose environment.agents are "
                 f"{listed(spec.agents or possible)}: name a run that plays exactly the agents of these seats"

@@ -397,6 +397,8 @@ class Duel(ParallelEnv):
     def __init__(self, problem: str = "") -> None:
         self.metadata, self.possible_agents = {"name": "duel"}, ["red", "blue"]
         self.problem = problem
+        if problem == "same name":
+            self.possible_agents = ["red", "red"]
 
     def observation_space(self, agent: str) -> Box:
         return Box(0.0, 1.0, (3 if self.problem == "spaces" and agent == "blue" else 2,), np.float32)
@@ -584,7 +586,7 @@ def test_rewards_of_a_game_in_turns_that_its_agents_do_not_get_are_a_warning(fau
     ("fault", "text"),
     [
         ("stays", "red has ended, but is still in its `agents` after step(None): call _was_dead_step(action) there"),
-        ("no end", "blue has left its `agents` without an end"),
+        ("no end", "red has left its `agents` without an end"),
     ],
 )
 def test_ends_of_a_game_in_turns_that_are_none_are_named(fault: str, text: str) -> None:
@@ -667,6 +669,7 @@ def test_a_game_is_checked() -> None:
             "its rewards have an entry for 'Red', which is no agent: its possible_agents are red, blue",
         ),
         ("no choice", {}, "forbids every choice"),
+        ("same name", {}, r"its possible_agents are \['red', 'red'\]: name at least one"),
         ("stays", {}, "red has ended, but is still in its `agents` after its last step: remove it there"),
         ("all, stays", {}, "red has ended, but is still in its `agents`"),
         ("no end", {}, "red has left its `agents` without an end"),
