@@ -122,7 +122,7 @@ class Policy:
     ) -> Decisions:
         """Choose actions for many observations that do not follow each other, with values and probabilities.
 
-        It needs torch, and leaves the episode of `act` as it is.
+        It needs torch, and leaves the episode of `act` as it is. Several threads may call it at once.
 
         Args:
           observations: N observations of the environment's own space.

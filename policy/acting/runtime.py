@@ -189,7 +189,7 @@ class OnnxRuntime:
         self._shapes = {name: shape for name, shape in inputs.items() if name not in others}
         convolutional = any(len(shape) > 2 for shape in self._shapes.values())
         self._loads_again = convolutional and (rows is None or rows > _FEW_ROWS)
-        self._feed: dict[str, np.ndarray] = {}
+        self._weights: dict[str, np.ndarray] = {}  # which each call passes
 
     def fork(self) -> "OnnxRuntime":
         """Return another runtime of the same program, which loads weights of its own.
@@ -197,7 +197,7 @@ class OnnxRuntime:
         Several versions of a policy can so act in turn, on one thread, without loading weights again.
         """
         other = copy.copy(self)
-        other._feed = {}
+        other._weights = {}
         if self._loads_again:  # it will have a session of its own, and may load it on another thread
             other._watchdog = CallWatchdog(self._stop)
         return other
@@ -231,7 +231,7 @@ class OnnxRuntime:
         if self._loads_again:
             self._session = ProgramSession(with_initializers(self._model, bound), self._watchdog, self._threads)
         else:
-            self._feed = bound
+            self._weights = bound
 
     def act(
         self,
@@ -242,11 +242,11 @@ class OnnxRuntime:
         epsilon: np.ndarray | None = None,
     ) -> Choice:
         """See PolicyRuntime. Raises PolicyError if the program fails, or its outputs have wrong shapes."""
-        feed = self._feed
+        feed = self._weights.copy()  # calls of several threads do not see the inputs of each other
         for name, values in observations.items():
-            self._set(_OBSERVATIONS + name, values)
+            self._set(feed, _OBSERVATIONS + name, values)
         for name, mask in masks.items():
-            self._set(_MASKS + name, mask)
+            self._set(feed, _MASKS + name, mask)
         if self._state_size:
             feed[STATE] = state
         if self._noise_size.uniform:
@@ -257,12 +257,12 @@ class OnnxRuntime:
             feed[EPSILON] = no_exploration(len(state)) if epsilon is None else epsilon
         return self._checked(self._session.run(feed), state)
 
-    def _set(self, name: str, values: np.ndarray) -> None:
+    def _set(self, feed: dict[str, np.ndarray], name: str, values: np.ndarray) -> None:
         """Set an input. One that the network does not use, such as by an encoder of the user, is not in the program."""
         if name in self._integers:
-            self._feed[name] = values.astype(np.int64)
+            feed[name] = values.astype(np.int64)
         elif name in self._components:
-            self._feed[name] = values
+            feed[name] = values
 
     def _checked(self, outputs: list[np.ndarray], state: np.ndarray) -> Choice:
         rows = len(state)

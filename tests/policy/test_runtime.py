@@ -142,6 +142,25 @@ def test_samples_depend_only_on_the_generator(runtime: PolicyRuntime, one_policy
     assert (first != other).any()
 
 
+def test_a_call_of_another_thread_does_not_change_the_inputs(
+    one_policy: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime = one_policy.runtimes()[0]
+    assert isinstance(runtime, OnnxRuntime)
+    runtime.load(one_policy.weights())
+    ones, twos = np.ones((3, 4), np.float32), np.full((3, 4), 2.0, np.float32)
+    expected, run = act_without_memory(runtime, ones), runtime._session.run
+
+    def run_after_another(feed: dict[str, np.ndarray]) -> list[Any]:
+        monkeypatch.undo()
+        act_without_memory(runtime, twos)
+        return run(feed)
+
+    monkeypatch.setattr(runtime._session, "run", run_after_another)
+    for given, wanted in zip(act_without_memory(runtime, ones), expected, strict=True):
+        np.testing.assert_array_equal(given, wanted)
+
+
 def test_bytes_are_scaled_to_the_unit_interval() -> None:
     policy = make_policy({"hidden": (4,), "activation": "relu"}, spaces((1,), actions=2))
     weights = {name: np.zeros_like(array) for name, array in policy.weights().items()}
