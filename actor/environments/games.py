@@ -214,6 +214,7 @@ class GameEnvironments:
                 self._acts[seat] = False
                 if outcome.info:
                     kept = info_to_keep(dict(outcome.info), ended=True)
+                    kept.pop(MASK_KEY, None)  # it may be lists of different lengths
                     self._episode_info.add({name: np.array([kept[name]]) for name in kept}, np.array([True]))
 
     def _write(self, seat: int, outcome: Outcome) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scripted_games
 from collectors import collect, started_collector
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo import AECEnv, ParallelEnv
@@ -471,6 +471,26 @@ def test_agents_that_always_observe_the_same_are_a_warning(fields: dict[str, Any
     report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=80)
     # Nor is it one that the number of the agent, which differs between the agents, never changes for one of them.
     assert ["--set environment.agent_ids=true" in warning for warning in report.warnings] == [True] * (not fields)
+
+
+class Lists(Board):
+    """Its masks are lists of different lengths, as `sample` of a MultiDiscrete takes them."""
+
+    def action_space(self, agent: str) -> Any:
+        return MultiDiscrete([2, 3])
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        assert all(action[0] == 0 and action[1] > 0 for action in actions.values())
+        return super().step({agent: action[0] for agent, action in actions.items()})
+
+    def _info(self) -> dict[str, dict]:
+        return {agent: {"action_mask": ([1, 0], [0, 1, 1])} for agent in self.possible_agents}
+
+
+def test_masks_of_a_game_may_be_lists_of_different_lengths() -> None:
+    spec = EnvironmentSpec(id="test_games:Lists", backend="pettingzoo")
+    report = check_environment(spec, UserModules(frozenset({"test_games"})), seconds=60.0, env_steps=20)
+    assert (report.problems, set(report.lengths)) == ((), {5})
 
 
 class Drawn(Board):
