@@ -415,7 +415,9 @@ class Duel(ParallelEnv):
             raise RuntimeError("the table broke")
         self.left -= 1
         here, over = self.agents, self.left <= 0 and (self.problem != "endless" or actions["red"] == 1)
-        rewards = {agent: float(actions[agent]) if self.problem != "reward" else np.nan for agent in here}
+        rewards: dict[str, Any] = {
+            agent: float(actions[agent]) if self.problem != "reward" else np.nan for agent in here
+        }
         self.agents = here if not over or self.problem.endswith("stays") else []
         terminated = dict.fromkeys(here, over and self.problem not in ("no end", "all, stays"))
         if self.problem == "other agent":
