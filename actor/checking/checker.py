@@ -210,7 +210,7 @@ def _beginning(
         return [leaf.of(each).copy() for each in observations for leaf in read]
 
     if isinstance(environment, GameEnvironments):
-        (copy,) = environment.copies_for(environment.agents)
+        (copy,) = environment.copies_for()
         seen = partial(numbered, number=0) if spec.agent_ids else lambda observation: observation
         return lambda seed: shown(seen(outcome.observation) for outcome in copy.reset(seed))
     return lambda seed: shown([environment.reset(seed=seed)[0]])

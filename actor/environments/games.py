@@ -66,7 +66,7 @@ class GameEnvironments:
         self._numbers = {agent: number for number, agent in enumerate(seats)}
         self._random = [np.random.default_rng(number) for number in range(len(copies))]
         self._others: dict[str, LegalActions] = {}  # of the agents without a seat
-        self._games = self.copies_for(seats)
+        self._games = self.copies_for()
         self._bots: list[Bot | None] = [None] * self.count  # of the seats, from the next match on
         self._in_match: list[Bot | None] = [None] * self.count
         self._newest: list[tuple[Any, Any]] = [(None, None)] * self.count  # observation and mask of each bot's seat
@@ -93,8 +93,10 @@ class GameEnvironments:
         self._has_masks: bool | None = None  # in `info`; None before the first reset
         self.reset(0)
 
-    def copies_for(self, agents: Sequence[str]) -> list[GameCopy]:
-        """Return each copy as a game in which these agents have seats; the others take random legal actions."""
+    def copies_for(self, agents: Sequence[Any] = ()) -> list[GameCopy]:
+        """Return each copy as a game in which these agents have seats, or those of this object; the others take random
+        legal actions."""
+        agents = agents or tuple(self._numbers)
         return [
             game_copy(environment, agents, partial(self._random_action, number), self._warn_of_lost_reward)
             for number, environment in enumerate(self._environments)
@@ -136,7 +138,7 @@ class GameEnvironments:
     def _begin_match(self, number: int, seed: int | None) -> list[Outcome]:
         """Reset a copy, play its opening, and return what is new for the agents that have seats."""
         self._abandoned[number] = False
-        for agent, place in self._numbers.items():
+        for place, agent in enumerate(self.agents):
             seat = number * self.seats + place
             bot = self._in_match[seat] = self._bots[seat]
             if bot is not None:
@@ -277,6 +279,12 @@ class GameEnvironments:
     def _random_action(self, number: int, agent: str, observation: Any, info: Any) -> Any:
         """Return a legal action of an agent without a seat."""
         if agent not in self._others:
+            possible = self._environments[0].possible_agents
+            if agent not in possible:
+                raise EnvironmentSetupError(
+                    f"{agent!r} is in its `agents`, but not in its possible_agents, which are {listed(possible)}: the "
+                    "policy could not play it"
+                )
             self._others[agent] = LegalActions(self._environments[0].action_space(agent))
         return self._others[agent].sample(mask_of(observation, info), self._random[number])
 

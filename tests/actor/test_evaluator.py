@@ -348,7 +348,7 @@ def test_evaluator_stops_between_evaluations(network: MemoryNetwork) -> None:
     evaluator.stop.set()
     evaluator.join()
     assert evaluator.error is None
-    assert LINES[-1] == "stopped"
+    assert LINES[-1] == "this process was stopped"
     assert learner.received.empty()
 
 
@@ -394,7 +394,7 @@ def test_evaluator_stops_in_the_middle_of_an_episode_and_closes_its_environments
     evaluator.stop.set()
     evaluator.join()
     assert evaluator.error is None
-    assert LINES[-1] == "stopped"
+    assert LINES[-1] == "this process was stopped"
     assert endless.closed.is_set()
     assert learner.received.empty()  # an unfinished evaluation is not reported
 

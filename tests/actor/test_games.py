@@ -408,7 +408,10 @@ class Duel(ParallelEnv):
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Any:
         self.agents, self.left = list(self.possible_agents), 5
-        return self._seen(), self._info()
+        seen = self._seen()
+        if self.problem == "unknown agent":
+            self.agents, seen = ["green", *self.agents], seen | {"green": seen["red"]}
+        return seen, self._info()
 
     def step(self, actions: dict[str, int]) -> Any:
         if self.problem == "raises":
@@ -690,6 +693,7 @@ def test_a_game_is_checked() -> None:
             {},
             "its rewards have an entry for 'Red', which is no agent: its possible_agents are red, blue",
         ),
+        ("unknown agent", {}, "'green' is in its `agents`, but not in its possible_agents, which are red, blue"),
         ("no choice", {}, "forbids every choice"),
         ("same name", {}, r"its possible_agents are \['red', 'red'\]: name at least one"),
         ("stays", {}, "red has ended, but is still in its `agents` after its last step: remove it there"),
