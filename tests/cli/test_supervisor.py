@@ -92,6 +92,7 @@ def test_a_process_that_failed_three_times_is_not_restarted() -> None:
 def test_a_process_that_ends_three_times_is_not_restarted(
     monkeypatch: pytest.MonkeyPatch, program: str, options: dict[str, Any], said: str, failure: str
 ) -> None:
+    # Else an ended process is restarted after 30 s, in which the others may end, too.
     monkeypatch.setattr(supervision, "_LEAVING_SECONDS", 0.0)
     process = supervised(program, **options)
     assert [message(process), message(process)] == [f"worker {said}; started again"] * 2
