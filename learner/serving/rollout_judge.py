@@ -55,6 +55,10 @@ class Rejected:
     reason: str
 
 
+def _unknown(sender: str) -> Rejected:
+    return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
+
+
 class RolloutJudge:
     """Judge of rollouts by the run's specification and the state of the fleet."""
 
@@ -77,7 +81,7 @@ class RolloutJudge:
         if size <= _SLACK_BYTES:
             return None
         if spaces is None or actor is None:
-            return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
+            return _unknown(sender)
         plain, queue = self._limits(spaces, actor.environments).message_bytes, self._spec.service.queue_bytes
         if size > plain:
             reason = f"the message has {size:,} bytes, and a rollout of this actor at most {plain:,}"
@@ -104,7 +108,7 @@ class RolloutJudge:
         """
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
         if spaces is None or actor is None:
-            return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
+            return _unknown(sender)
         if actor.quarantined:
             return Rejected(verdict="quarantined", cause="quarantined", reason=actor.quarantined)
         limits = self._limits(spaces, actor.environments)
