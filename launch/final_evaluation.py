@@ -13,8 +13,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episodes import EvaluationStoppedError
 from daedalus.launch.evaluation_options import EvaluationOptions, evaluated_environment
@@ -32,7 +30,7 @@ from daedalus.learner.league.versions import opponent_copy
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.evaluator_host import EpisodePlan, EvaluatorError, EvaluatorHost, OfferedPolicy
-from daedalus.policy.acting.runtime import PolicyError, program_hash
+from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.saving.best_checkpoints import best_score, is_best, is_best_in_training, rescore
 from daedalus.policy.saving.hub import HubError
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, read_candidates
@@ -236,8 +234,9 @@ class FinalEpisodes:
 
 
 def _offered(policy: SavedPolicy) -> OfferedPolicy:
-    program = Program(hash=program_hash(policy.program), model=np.frombuffer(policy.program, np.uint8))
-    return OfferedPolicy(policy_version=policy.policy_version, program=program, weights=policy.weights)
+    return OfferedPolicy(
+        policy_version=policy.policy_version, program=Program.of(policy.program), weights=policy.weights
+    )
 
 
 def main() -> int:

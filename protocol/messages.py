@@ -367,8 +367,18 @@ class Refusal:
 class Program:
     """The policy's forward pass as an ONNX model without weights, in answer to a `program` query."""
 
-    hash: str  # SHA-256 of `model`, hexadecimal
+    hash: str  # see program_hash
     model: np.ndarray  # [bytes] uint8
+
+    @classmethod
+    def of(cls, model: bytes) -> "Program":
+        """Return the message with a model."""
+        return cls(hash=program_hash(model), model=np.frombuffer(model, np.uint8))
+
+
+def program_hash(model: bytes) -> str:
+    """Return the name of a program: the SHA-256 of its bytes, in hexadecimal."""
+    return hashlib.sha256(model).hexdigest()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

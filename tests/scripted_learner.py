@@ -12,7 +12,6 @@ from daedalus.actor.session.actor_config import ActorConfig, LinkChoice
 from daedalus.actor.session.actor_service import ActorService, Collector
 from daedalus.learner.serving.snapshot_publisher import CompactSnapshotCache
 from daedalus.policy.acting.program import export_program
-from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -28,6 +27,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     SnapshotRequest,
     Welcome,
+    program_hash,
 )
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
@@ -118,7 +118,7 @@ class ScriptedLearner:
 
     def _program(self, request: Request) -> None:
         model = self.policy.model
-        request.reply(encode(Program(hash=program_hash(model), model=np.frombuffer(model, np.uint8))))
+        request.reply(encode(Program.of(model)))
 
     def publish(self, version: int, *, push: bool = True) -> None:
         weights = {name: parameter.detach().numpy() for name, parameter in self.policy.network.named_parameters()}

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias, TypeVar
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError, ActorRefusedError, LearnerLostError, NameInUseError, NoLearnerError
 from daedalus.actor.session.actor_config import ActorConfig
-from daedalus.policy.acting.runtime import PolicyError, program_hash
+from daedalus.policy.acting.runtime import PolicyError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, UnfitMessageError, VersionMismatchError, decode, encode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, LEARNER_LIMITS
@@ -33,6 +33,7 @@ from daedalus.protocol.messages import (
     Refusal,
     RunEnded,
     Welcome,
+    program_hash,
     starts_of,
 )
 from daedalus.protocol.releases import as_release, own_release

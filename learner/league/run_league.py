@@ -25,12 +25,11 @@ from daedalus.learner.league.versions import KeptVersion, VersionFolder, encoded
 from daedalus.learner.run.resuming import other_spaces
 from daedalus.learner.run.run_directory import LEAGUE
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.saving.sealed import DamagedError, UnreadableError
 from daedalus.protocol.codec import encode
 from daedalus.protocol.league import LeagueStatus, Matches, Plan, is_bot, version_name, version_of
-from daedalus.protocol.messages import LeaguePlan, Program, Refusal, Snapshot
+from daedalus.protocol.messages import LeaguePlan, Program, Refusal, Snapshot, program_hash
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import bounded_text
@@ -78,7 +77,7 @@ class League:
         for name in self._fixed:
             if not is_bot(name):
                 policy = self._runs[name] = opponent_run(name, self._folder)
-                program = Program(hash=program_hash(policy.program), model=np.frombuffer(policy.program, np.uint8))
+                program = Program.of(policy.program)
                 self._programs[program.hash] = encode(program)
 
     def check_opponents(self, spaces: Spaces) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.waiting_requests import read_request
-from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import Bits, bfloat16, planes
@@ -276,7 +275,7 @@ class SnapshotPublisher:
 
     def offer_program(self, model: bytes) -> None:
         """Make the policy program available to queries."""
-        self.offered = Program(hash=program_hash(model), model=np.frombuffer(model, np.uint8))
+        self.offered = Program.of(model)
         self._program = encode(self.offered)
 
     def publish_if_due(

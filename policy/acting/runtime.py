@@ -4,7 +4,6 @@ TorchRuntime (policy/acting/torch_runtime.py) runs the network itself, for actor
 """
 
 import copy
-import hashlib
 import threading
 from typing import Any, NamedTuple, Protocol
 
@@ -131,11 +130,6 @@ class PolicyRuntime(Protocol):
           epsilon: [E, 1] float32, the final epsilon of each row, for a policy that `explores`; None: no exploration.
         """
         ...
-
-
-def program_hash(model: bytes) -> str:
-    """Return the name of a program: the SHA-256 of its bytes, in hexadecimal."""
-    return hashlib.sha256(model).hexdigest()
 
 
 def observation_name(component: str) -> str:

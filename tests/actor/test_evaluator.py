@@ -19,7 +19,6 @@ from daedalus.actor.errors import ActorError
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.actor_config import ActorConfig, own_origin
 from daedalus.policy.acting.program import export_program
-from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -34,6 +33,7 @@ from daedalus.protocol.messages import (
     Refusal,
     Snapshot,
     Welcome,
+    program_hash,
 )
 from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.transport.interface import Request
@@ -84,7 +84,7 @@ class ScriptedLearner:
         request.reply(encode(welcome))
 
     def _program(self, request: Request) -> None:
-        request.reply(encode(Program(hash=program_hash(MODEL), model=np.frombuffer(MODEL, np.uint8))))
+        request.reply(encode(Program.of(MODEL)))
 
     def snapshot(self, version: int, action: int = 0, epoch: int | None = None) -> Snapshot:
         """A policy whose most probable action is always the same; other actions are possible too."""

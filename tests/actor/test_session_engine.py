@@ -25,7 +25,6 @@ from daedalus.actor.session.conversation import (
 )
 from daedalus.actor.session.session_engine import ActorSession, Begin, Collect, Encode, Load, Prepare
 from daedalus.learner.serving.snapshot_publisher import CompactSnapshotCache
-from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -40,6 +39,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     SnapshotRequest,
     new_epoch,
+    program_hash,
 )
 from daedalus.protocol.messages import Welcome as WelcomeMessage
 from daedalus.protocol.spec import RunSpec
@@ -158,7 +158,7 @@ class PlayedSession:
 
     def _answers(self, key: str, payload: bytes) -> list[Message]:
         if "/program/" in key:
-            return [Program(hash=program_hash(PROGRAM), model=np.frombuffer(PROGRAM, np.uint8))]
+            return [Program.of(PROGRAM)]
         if key == keys.snapshots(self.session.run):
             return [self.snapshot()]
         assert isinstance(decode(payload, Limits()), Join)

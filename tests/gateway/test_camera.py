@@ -25,9 +25,9 @@ from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts
 from daedalus.gateway.learner_link import NewestPolicy
 from daedalus.gateway.watching.camera import CameraProcess
 from daedalus.gateway.watching.playing_process import PolicySource, frame
-from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
+from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.policy.user_modules import NO_MODULES
-from daedalus.protocol.messages import Snapshot, Welcome
+from daedalus.protocol.messages import Snapshot, Welcome, program_hash
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 

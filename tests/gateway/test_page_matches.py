@@ -21,9 +21,8 @@ from daedalus.gateway.learner_link import NewestPolicy
 from daedalus.gateway.watching import person_matches as matches_module
 from daedalus.gateway.watching.person_matches import Matches
 from daedalus.gateway.watching.playing_process import PolicySource
-from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.user_modules import NO_MODULES
-from daedalus.protocol.messages import Snapshot, Welcome
+from daedalus.protocol.messages import Snapshot, Welcome, program_hash
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.memory import MemoryNetwork
 

@@ -28,10 +28,10 @@ from daedalus.policy.acting.runtime import (
     PolicyRuntime,
     action_name,
     observation_name,
-    program_hash,
     with_initializers,
 )
 from daedalus.policy.acting.torch_runtime import TorchRuntime
+from daedalus.protocol.messages import program_hash
 from daedalus.protocol.spec import PolicySpec
 
 OBSERVATIONS, ACTIONS = observation_name(NAME), action_name(ACTION)
