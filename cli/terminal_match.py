@@ -16,6 +16,7 @@ from daedalus.launch.evaluation_options import (
     check_spaces,
     chosen_policy,
     environment_of,
+    loaded_runtime,
     modules_of,
 )
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -53,10 +54,8 @@ def play_at_terminal(options: EvaluationOptions, seat: str | None, stop: threadi
             if seat is not None and seat not in match.agents:
                 raise EnvironmentSetupError(f"--seat is {seat!r}: choose from {', '.join(match.agents)}")
             check_spaces(match.spaces, spec.environment, policy)
-            runtime = OnnxRuntime(policy.program, stop)
-            runtime.load(policy.weights)
             actions = actions_of(policy, options)
-            table = _Table(match, runtime, spec, actions == "sampled", Conversation(stop, out))
+            table = _Table(match, loaded_runtime(policy, stop), spec, actions == "sampled", Conversation(stop, out))
             table.conversation.say(
                 f"{spec.environment.id}, policy version {policy.policy_version}, {actions} actions. Ctrl-D: end"
             )

@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.evaluation.video import FORMATS
 from daedalus.launch.environment_object import NO_ENVIRONMENT, EnvironmentObject
+from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.hub import pull
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy, pretrained
 from daedalus.policy.user_modules import UserModules, module_of
@@ -157,6 +159,13 @@ def modules_of(policy: SavedPolicy, options: EvaluationOptions) -> UserModules:
 def actions_of(policy: SavedPolicy, options: EvaluationOptions) -> str:
     """Return "greedy" or "sampled"."""
     return options.actions or policy.spec.evaluation.actions
+
+
+def loaded_runtime(policy: SavedPolicy, stop: threading.Event) -> OnnxRuntime:
+    """Return what runs a policy, with its weights. `stop` ends a call; it then raises PolicyError."""
+    runtime = OnnxRuntime(policy.program, stop)
+    runtime.load(policy.weights)
+    return runtime
 
 
 def check_spaces(spaces: Spaces, spec: EnvironmentSpec, policy: SavedPolicy) -> None:

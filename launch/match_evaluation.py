@@ -3,22 +3,30 @@
 import math
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
 
 from daedalus.actor.collecting.lineup import sides_of
-from daedalus.actor.environments.bots import Bot, make_bot
+from daedalus.actor.environments.bots import make_bot
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.episodes import EvaluationProgress, environments_for
-from daedalus.actor.evaluation.matches import MatchResults, play_matches
-from daedalus.launch.evaluation_options import EvaluationOptions, actions_of, check_spaces, environment_of, modules_of
-from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.actor.evaluation.matches import MatchPlan, MatchResults, play_matches
+from daedalus.launch.evaluation_options import (
+    EvaluationOptions,
+    actions_of,
+    check_spaces,
+    environment_of,
+    loaded_runtime,
+    modules_of,
+)
 from daedalus.policy.saving.best_checkpoints import evaluation_result
 from daedalus.policy.saving.hub import HubError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy
@@ -73,32 +81,21 @@ def evaluated_matches(
     longest, sampled = policy.spec.evaluation.max_episode_env_steps, actions_of(policy, options) == "sampled"
     progress = EvaluationProgress(stream, options.count, longest, stop)
     try:
-        with Surroundings():
-            games = make_games(spec, 1, modules, lambda _: _copies(policy, options) - 1)
-            try:
-                environments = TransformedEnvironment(games, spec)
-                check_spaces(environments.spaces, spec, policy)
-                sides = _sides(policy, games.agents, options.count)
-                opponent: OnnxRuntime | Callable[[], Bot]
-                if other is not None:
-                    opponent = _runtime(other, stop)
-                else:
-                    name, space = options.against, games.action_space
-                    opponent = lambda: make_bot(name, space, modules, "--against")  # noqa: E731
-                results = play_matches(
-                    environments,
-                    sides,
-                    _runtime(policy, stop),
-                    opponent,
-                    options.count // len(sides),
-                    seed,
-                    sampled=sampled,
-                    openings=options.openings,
-                    longest=longest,
-                    progress=progress,
-                )
-            finally:
-                games.close()
+        with Surroundings(), closing(make_games(spec, 1, modules, lambda _: _copies(policy, options) - 1)) as games:
+            environments = TransformedEnvironment(games, spec)
+            check_spaces(environments.spaces, spec, policy)
+            sides = _sides(policy, games.agents, options.count)
+            bot = partial(make_bot, options.against, games.action_space, modules, "--against")
+            opponent = bot if other is None else loaded_runtime(other, stop)
+            plan = MatchPlan(
+                sides=sides,
+                matches=options.count // len(sides),
+                seed=seed,
+                sampled=sampled,
+                openings=options.openings,
+                longest=longest,
+            )
+            results = play_matches(environments, plan, loaded_runtime(policy, stop), opponent, progress)
     finally:
         progress.end()
     agents = [tuple(games.agents[seat] for seat in side) for side in sides]
@@ -168,12 +165,6 @@ def _opponent(name: str, policy: SavedPolicy) -> SavedPolicy:
             f"to evaluate on {policy.spec.environment.id} with {policy.spaces}: both must have the same spaces"
         )
     return found
-
-
-def _runtime(policy: SavedPolicy, stop: threading.Event) -> OnnxRuntime:
-    runtime = OnnxRuntime(policy.program, stop)
-    runtime.load(policy.weights)
-    return runtime
 
 
 def _score(results: MatchResults, chosen: np.ndarray, agents: tuple[str, ...]) -> MatchScore:

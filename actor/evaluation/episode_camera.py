@@ -11,7 +11,7 @@ from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.rendering import FrameRate
 from daedalus.actor.environments.transforms import TransformedEnvironment
-from daedalus.actor.evaluation.episodes import RunningEpisodes, refuse_unfit_rewards
+from daedalus.actor.evaluation.episodes import SEEDS, RunningEpisodes, refuse_unfit_rewards
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.policy.user_modules import UserModules
@@ -22,7 +22,6 @@ _SAMPLES, _FEW_SAMPLES = 64, 8  # of the action, for its probabilities; few wher
 _LARGE = 4096  # numbers in an observation
 _MOST_SHOWN = 12  # choices or numbers of one component of the action
 _LARGEST_SIDE = 640  # of a picture, in pixels
-_SEEDS = 2**30
 
 
 Estimate = Callable[[dict[str, np.ndarray], np.ndarray], float | None]
@@ -88,7 +87,7 @@ class EpisodeCamera:
         """
         environments, spaces, seats = self._environments, self._environments.spaces, len(self._agents)
         running = RunningEpisodes(spaces, runtime, seats)
-        observed = environments.reset(int(self._random.integers(_SEEDS)))
+        observed = environments.reset(int(self._random.integers(SEEDS)))
         running.observe(observed)
         acting = np.arange(seats) if observed.acting is None else np.flatnonzero(observed.acting)
         total = 0.0

@@ -35,34 +35,35 @@ class MatchResults:
     distinct: int  # number of matches that differ in what was observed
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchPlan:
+    """Which matches to play, and how. Match k of each side has the same seed of the game and the same opening."""
+
+    sides: Sequence[Sequence[int]]  # the numbers of the agents of each side, at least two sides
+    matches: int  # of each side
+    seed: int  # of the games, of openings and of sampled actions
+    sampled: bool  # whether policies sample their actions instead of choosing the most probable ones
+    openings: int = 0  # env_steps at the start of each match in which all agents take random legal actions
+    longest: int = LONGEST  # env_steps, after which a match is cut
+
+
 def play_matches(
     environments: TransformedEnvironment,
-    sides: Sequence[Sequence[int]],
+    plan: MatchPlan,
     policy: PolicyRuntime,
     opponent: PolicyRuntime | Callable[[], Bot],
-    matches: int,
-    seed: int,
-    *,
-    sampled: bool,
-    openings: int = 0,
-    longest: int = LONGEST,
     progress: Callable[[int, float], bool] = no_progress,
 ) -> MatchResults:
     """Play matches in which the policy has one side, and the opponent all others.
 
-    Match k of each side has the same seed of the game and the same random opening. Its result does not depend on how
-    many copies of the game there are, if a reset with a seed determines the whole match.
+    The result of a match does not depend on how many copies of the game there are, if a reset with a seed determines
+    the whole match.
 
     Args:
       environments: copies of a game, which are reset first and not closed.
-      sides: the numbers of the agents of each side, at least two sides.
+      plan: the matches.
       policy: with its weights loaded.
       opponent: another policy with its weights, or what makes a bot for one seat.
-      matches: how many to play for each side.
-      seed: of the games, of openings and of sampled actions.
-      sampled: whether policies sample their actions instead of choosing the most probable ones.
-      openings: number of env_steps at the start of each match in which all agents take random legal actions.
-      longest: cut each match after this many env_steps.
       progress: called after every step with the number of matches that ended and the policy's mean return (NaN at
         first).
 
@@ -70,16 +71,16 @@ def play_matches(
     """
     games = environments.games
     assert games is not None
-    game_seed, action_seed, opening_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(3))
+    game_seed, action_seed, opening_seed = (int(word) for word in np.random.SeedSequence(plan.seed).generate_state(3))
     seats, count = games.seats, games.count
     policies = [policy] if callable(opponent) else [policy, opponent]
     bots = [_OpeningBot(opponent(), games.action_space) for _ in range(count)] if callable(opponent) else []
-    table = _Table(environments, sides, matches, openings, longest, progress)
+    table = _Table(environments, plan, progress)
     games.resting[:] = True  # a copy whose match is over waits for the others
-    for side, members in enumerate(sides):
+    for side, members in enumerate(plan.sides):
         noise_seed = int(np.random.SeedSequence([action_seed, side]).generate_state(1)[0])
         is_policys = np.tile(np.isin(np.arange(seats), list(members)), count // seats)
-        for first in range(0, matches, count // seats):
+        for first in range(0, plan.matches, count // seats):
             random = [np.random.default_rng([opening_seed, first + row // seats, row % seats]) for row in range(count)]
             for row, bot in enumerate(bots):
                 bot.random = random[row]
@@ -87,13 +88,13 @@ def play_matches(
             players = [
                 _Player(
                     RunningEpisodes(environments.spaces, runtime, count),
-                    EpisodeNoise(runtime.noise_size, noise_seed, first * seats, count, sampled),
+                    EpisodeNoise(runtime.noise_size, noise_seed, first * seats, count, plan.sampled),
                     is_policys if number == 0 else ~is_policys,
                 )
                 for number, runtime in enumerate(policies)
             ]
             observed = environments.reset(game_seed % SEEDS + first)  # copy c gets this seed + c
-            table.play(observed, players, bots, random, side, first)
+            table.play(_Round(side, first, players, bots, random), observed)
     return table.results()
 
 
@@ -124,51 +125,47 @@ class _Player(NamedTuple):
     plays: np.ndarray  # [seats] bool
 
 
+class _Round(NamedTuple):
+    """One match in each copy of the game: match `first` of a side, and the following ones."""
+
+    side: int
+    first: int
+    players: Sequence[_Player]
+    bots: Sequence[_OpeningBot]
+    random: Sequence[np.random.Generator]  # of openings, by seat
+
+
 class _Table:
     """The copies of the game, and the results of all matches: those of the first side, of the second and so on."""
 
     def __init__(
-        self,
-        environments: TransformedEnvironment,
-        sides: Sequence[Sequence[int]],
-        matches: int,
-        openings: int,
-        longest: int,
-        progress: Callable[[int, float], bool],
+        self, environments: TransformedEnvironment, plan: MatchPlan, progress: Callable[[int, float], bool]
     ) -> None:
-        self._environments, self._sides, self._matches = environments, [list(side) for side in sides], matches
-        self._openings, self._longest, self._progress = openings, longest, progress
-        self._seats = environments.seats
-        self._returns = np.zeros((len(sides) * matches, self._seats))
-        self._lengths = np.zeros(len(sides) * matches, np.int32)
-        self._ended = np.zeros(len(sides) * matches, np.bool_)
+        self._environments, self._plan, self._progress = environments, plan, progress
+        self._sides = [list(side) for side in plan.sides]
+        self._seats, count = environments.seats, len(plan.sides) * plan.matches
+        self._returns = np.zeros((count, self._seats))
+        self._lengths = np.zeros(count, np.int32)
+        self._ended = np.zeros(count, np.bool_)
         self._finished: list[float] = []  # mean returns of the policy's agents in matches that ended
         self._courses: set[tuple[int, bytes]] = set()  # of the matches that ended
 
-    def play(
-        self,
-        observed: Observed,
-        players: Sequence[_Player],
-        bots: Sequence[_OpeningBot],
-        random: Sequence[np.random.Generator],
-        side: int,
-        first: int,
-    ) -> None:
-        """Play one match in each copy: `first` and the following ones of a side. `random` is that of openings."""
-        copies = self._environments.count // self._seats
-        playing = first + np.arange(copies) < self._matches
-        records = side * self._matches + first + np.arange(copies)  # of the matches
+    def play(self, round: _Round, observed: Observed) -> None:
+        """Play a round, from the first observations on."""
+        side, plan, copies = round.side, self._plan, self._environments.count // self._seats
+        numbers = round.first + np.arange(copies)  # of the matches of this side
+        playing, records = numbers < plan.matches, side * plan.matches + numbers
         courses = [hashlib.blake2b(digest_size=16) for _ in range(copies)]
-        for step in range(self._longest):
-            for bot in bots:
-                bot.opens = step < self._openings
-            for player in players:
+        for step in range(plan.longest):
+            for bot in round.bots:
+                bot.opens = step < plan.openings
+            for player in round.players:
                 player.episodes.observe(observed)
             for copy in np.flatnonzero(playing).tolist():
                 courses[copy].update(self._shown(observed, copy))
-            actions = self._actions(players, np.repeat(playing, self._seats))
-            if step < self._openings:
-                self._open(observed, actions, random, np.any([player.plays for player in players], axis=0))
+            actions = self._actions(round.players, np.repeat(playing, self._seats))
+            if step < plan.openings:
+                self._open(round, observed, actions)
             observed, rewards, _, _ = self._environments.step(actions)
             rewards = rewards.reshape(copies, self._seats)[playing]
             refuse_unfit_rewards(rewards.ravel(), np.repeat(records[playing], self._seats))
@@ -178,7 +175,7 @@ class _Table:
             ended = playing & observed.over
             self._ended[records[ended]] = True
             playing &= ~ended
-            for copy in np.flatnonzero(ended | (playing & (step + 1 == self._longest))).tolist():
+            for copy in np.flatnonzero(ended | (playing & (step + 1 == plan.longest))).tolist():
                 courses[copy].update(self._shown(observed, copy))
                 self._courses.add((side, courses[copy].digest()))
             self._finished += self._returns[records[ended]][:, self._sides[side]].mean(axis=1).tolist()
@@ -196,18 +193,14 @@ class _Table:
                 actions[name] = np.where(player.plays[:, None], own, actions.get(name, own))
         return actions
 
-    def _open(
-        self,
-        observed: Observed,
-        actions: dict[str, np.ndarray],
-        random: Sequence[np.random.Generator],
-        plays: np.ndarray,
-    ) -> None:
-        """Write random legal actions in all seats that act and that policies play [seats]: bots draw their own."""
+    def _open(self, round: _Round, observed: Observed, actions: dict[str, np.ndarray]) -> None:
+        """Write random legal actions in all seats that act and that policies play: bots draw their own."""
         assert observed.acting is not None
+        plays = np.any([player.plays for player in round.players], axis=0)
         for row in np.flatnonzero(observed.acting & plays).tolist():
             masks = {name: mask[[row]] for name, mask in observed.masks.items()}
-            for name, values in RandomActions(self._environments.spaces.actions, random[row]).choose(masks).items():
+            chosen = RandomActions(self._environments.spaces.actions, round.random[row]).choose(masks)
+            for name, values in chosen.items():
                 actions[name][row] = values[0]
 
     def _shown(self, observed: Observed, copy: int) -> bytes:
@@ -220,7 +213,7 @@ class _Table:
 
     def results(self) -> MatchResults:
         """Return the results of all matches."""
-        sides = np.repeat(np.arange(len(self._sides)), self._matches)
+        sides = np.repeat(np.arange(len(self._sides)), self._plan.matches)
         means = np.stack([self._returns[:, members].mean(axis=1) for members in self._sides], axis=1)
         others = [[seat for seat in range(self._seats) if seat not in members] for members in self._sides]
         return MatchResults(

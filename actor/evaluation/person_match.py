@@ -13,14 +13,13 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.environments.vector_environments import Observed
-from daedalus.actor.evaluation.episodes import RunningEpisodes, refuse_unfit_rewards
+from daedalus.actor.evaluation.episodes import SEEDS, RunningEpisodes, refuse_unfit_rewards
 from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import ActorSpec
 
-_SEEDS = 2**30
 _MOST_MOVES = 64  # of the policy, that a Turn has: the newest
 
 Action = dict[str, list[float]]  # by component of the run's actions: an integer for each discrete variable, or numbers
@@ -94,7 +93,7 @@ class PersonMatch:
         self._returns, self._ended = np.zeros(count), np.zeros(count, np.bool_)
         self._number = self._steps = 0
         self._moves: list[tuple[str, Action]] = []
-        self._see(self._environment.reset(int(self._random.integers(_SEEDS)) if seed is None else seed))
+        self._see(self._environment.reset(int(self._random.integers(SEEDS)) if seed is None else seed))
         return self._play_on()
 
     def play(self, action: Mapping[str, Sequence[float]]) -> Turn:

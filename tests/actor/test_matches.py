@@ -11,7 +11,7 @@ from plain import PlainPolicy
 
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.transforms import TransformedEnvironment
-from daedalus.actor.evaluation.matches import MatchResults, play_matches
+from daedalus.actor.evaluation.matches import MatchPlan, MatchResults, play_matches
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -71,9 +71,8 @@ def test_outcomes_are_those_of_a_slow_account(
     environments = TransformedEnvironment(make_games(spec, copies, MODULES), spec)
     scripted_games.PLAYED.clear()
     opponent = AlwaysBot if is_bot else Always(3)
-    results = play_matches(
-        environments, sides, Always(4), opponent, matches, 1, sampled=False, openings=openings, longest=1000
-    )
+    plan = MatchPlan(sides=sides, matches=matches, seed=1, sampled=False, openings=openings, longest=1000)
+    results = play_matches(environments, plan, Always(4), opponent)
     environments.close()
     number, at = 0, 0  # a copy's matches have numbers, from that of the reset when it is made
     for side, members in enumerate(sides):
@@ -107,7 +106,8 @@ def tic_tac_toe(copies: int, matches: int, bot: type[AlwaysBot] | None = None, *
     runtime = OnnxRuntime(learner.program())
     runtime.load(learner.weights())
     try:
-        return play_matches(environments, ((0,), (1,)), runtime, bot or runtime, matches, 7, **options)
+        plan = MatchPlan(sides=((0,), (1,)), matches=matches, seed=7, **options)
+        return play_matches(environments, plan, runtime, bot or runtime)
     finally:
         environments.close()
 
