@@ -4,6 +4,7 @@ import io
 import operator
 import threading
 from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO, get_args
@@ -28,14 +29,14 @@ from daedalus.launch.evaluation_options import (
     check_spaces,
     chosen_policy,
     environment_of,
+    loaded_runtime,
     modules_of,
 )
 from daedalus.launch.match_evaluation import MatchScores, evaluated_matches
-from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import evaluation_result
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, refuse_while_imported
+from daedalus.policy.user_modules import ModuleNotAllowedError, refuse_while_imported
 from daedalus.protocol.spec import Backend, EnvironmentSpec
 
 if TYPE_CHECKING:
@@ -166,39 +167,34 @@ def run_evaluation(options: EvaluationOptions, stop: threading.Event, stream: Te
     trained = policy.spec.environment.id
     if options.against is not None:
         return evaluated_matches(policy, options, _seed(policy, options), stop, stream)
-    if options.env.maker is not None:
-        with giving(trained, options.env.maker):
-            return _evaluated(policy, options, stop, stream)
-    return _evaluated(policy, options, stop, stream)
+    with nullcontext() if options.env.maker is None else giving(trained, options.env.maker):
+        return _evaluated(policy, options, stop, stream)
 
 
 def _evaluated(
     policy: SavedPolicy, options: EvaluationOptions, stop: threading.Event, stream: TextIO
 ) -> dict[str, Any]:
-    spec, modules = environment_of(policy, options), modules_of(policy, options)
-    modules.check(spec.user_modules)
-    seed = _seed(policy, options)
+    spec = environment_of(policy, options)
+    modules_of(policy, options).check(spec.user_modules)
     progress = EvaluationProgress(stream, options.count, policy.spec.evaluation.max_episode_env_steps, stop)
-    filmed: dict[str, Any] = {}
-    notes: list[str] = []
     try:
-        if options.video is None:
-            with Surroundings():
-                evaluation = _play(policy, spec, modules, options, seed, progress, None)
-        else:
-            with (
-                Video(options.video, width=options.width, max_seconds=options.max_seconds) as video,
-                Surroundings(),
-            ):
-                evaluation = _play(policy, spec, modules, options, seed, progress, video)
-            filmed = {"video": str(options.video), "video_seconds": video.seconds}
-            if video.rate.guess:
-                notes.append(f"the speed of the video: {video.rate.guess}")
+        with (
+            Video(options.video, width=options.width, max_seconds=options.max_seconds)
+            if options.video
+            else nullcontext() as video,
+            Surroundings(),
+        ):
+            evaluation = _play(policy, spec, options, progress, video)
     finally:
         progress.end()
+    filmed: dict[str, Any] = {}
     actions = actions_of(policy, options)
     result = _result(policy, spec, evaluation, actions)
-    return {**result, "notes": [*result["notes"], *notes], "seed": seed, "actions": actions, **filmed}
+    if video is not None:
+        filmed = {"video": str(options.video), "video_seconds": video.seconds}
+        if video.rate.guess:
+            result["notes"].append(f"the speed of the video: {video.rate.guess}")
+    return {**result, "seed": _seed(policy, options), "actions": actions, **filmed}
 
 
 def _seed(policy: SavedPolicy, options: EvaluationOptions) -> int:
@@ -208,9 +204,7 @@ def _seed(policy: SavedPolicy, options: EvaluationOptions) -> int:
 def _play(
     policy: SavedPolicy,
     spec: EnvironmentSpec,
-    modules: UserModules,
     options: EvaluationOptions,
-    seed: int,
     progress: EvaluationProgress,
     video: Video | None,
 ) -> Evaluation:
@@ -219,20 +213,18 @@ def _play(
     environments = make_environments(
         spec,
         1 if watched else min(options.envs or environments_for(episodes, spec, policy.spec.collection), episodes),
-        modules=modules,
+        modules=modules_of(policy, options),
         render_mode="rgb_array" if video is not None else "human" if options.render else None,
         camera=None if video is None else video.add,
         one_episode=True,
     )
     try:
         check_spaces(environments.spaces, spec, policy)
-        runtime = OnnxRuntime(policy.program, progress.stop)
-        runtime.load(policy.weights)
         return play_episodes(
-            runtime,
+            loaded_runtime(policy, progress.stop),
             environments,
             episodes,
-            seed,
+            _seed(policy, options),
             sampled=actions_of(policy, options) == "sampled",
             longest=policy.spec.evaluation.max_episode_env_steps,
             progress=lambda finished, mean: progress(finished, mean) or (video is not None and video.is_full),

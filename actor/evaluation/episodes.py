@@ -229,20 +229,14 @@ def play_episodes(
     for an observation that a policy cannot act on.
     """
     environment_seed, action_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(2))
-    results = _Results(episodes)
+    table = _Table(runtime, environments, episodes, progress)
     seats = environments.seats
     for first in range(0, episodes, environments.count // seats):
-        random = EpisodeNoise(runtime.noise_size, action_seed, first * seats, environments.count, sampled)
+        noise = EpisodeNoise(runtime.noise_size, action_seed, first * seats, environments.count, sampled)
         observed = environments.reset(environment_seed % SEEDS + first)  # environment e gets this seed + e
-        if not _play_round(runtime, environments, observed, random, first, results, longest, progress):
+        if not table.play(observed, noise, first, longest):
             break
-    played = results.lengths > 0
-    _refuse_unfit_returns(results.returns)
-    return Evaluation(
-        returns=results.returns[played],
-        lengths=results.lengths[played],
-        cut=~results.ended[played],
-    )
+    return table.results()
 
 
 def _refuse_unfit_returns(returns: np.ndarray) -> None:
@@ -274,56 +268,55 @@ class EpisodeNoise:
         return joined_noise([draw_noise(self._size, 1, generator) for generator in self._generators])
 
 
-class _Results:
-    """Running returns and lengths of all episodes, by number."""
+class _Table:
+    """The environments, and the running returns and lengths of all episodes, by number."""
 
-    def __init__(self, episodes: int) -> None:
-        self.returns = np.zeros(episodes, np.float64)
-        self.lengths = np.zeros(episodes, np.int32)
-        self.ended = np.zeros(episodes, np.bool_)
+    def __init__(
+        self,
+        runtime: PolicyRuntime,
+        environments: VectorEnvironment,
+        episodes: int,
+        progress: Callable[[int, float], bool],
+    ) -> None:
+        self._runtime, self._environments, self._progress = runtime, environments, progress
+        self._returns = np.zeros(episodes, np.float64)
+        self._lengths = np.zeros(episodes, np.int32)
+        self._ended = np.zeros(episodes, np.bool_)
 
-    @property
-    def mean_return(self) -> float:
-        """Mean return of the episodes that ended; NaN without one."""
-        return float(self.returns[self.ended].mean()) if self.ended.any() else float("nan")
+    def play(self, observed: Observed, noise: EpisodeNoise, first: int, longest: int) -> bool:
+        """Play episode `first` + e in each environment e, from the first observations on. See play_episodes.
 
+        An episode of a game is a match, whose seats are all played by the policy; its return is their mean.
 
-def _play_round(
-    runtime: PolicyRuntime,
-    environments: VectorEnvironment,
-    observed: Observed,
-    random: EpisodeNoise,
-    first: int,
-    results: _Results,
-    longest: int,
-    progress: Callable[[int, float], bool],
-) -> bool:
-    """Play episode `first` + e in each environment e, from the first observations on. See play_episodes.
-
-    An episode of a game is a match, whose seats are all played by the policy; its return is their mean.
-
-    What an environment does after the end of its episode is ignored. Returns False if `progress` asked to stop.
-    """
-    count, seats = environments.count, environments.seats
-    games = count // seats
-    numbers = first + np.arange(games)  # of the episodes
-    running = RunningEpisodes(environments.spaces, runtime, count)
-    running.observe(observed)
-    playing = numbers < len(results.returns)
-    for _ in range(longest):
-        choice = running.act(random.draw(), np.repeat(playing, seats))
-        actions = {name: values[:count] for name, values in choice.actions.items()}
-        observed, rewards, terminated, truncated = environments.step(actions)
-        rewards = rewards if seats == 1 else rewards.reshape(games, seats).mean(axis=1)
-        refuse_unfit_rewards(rewards[playing], numbers[playing])
+        What an environment does after the end of its episode is ignored. Returns False if `progress` asked to stop.
+        """
+        environments, seats = self._environments, self._environments.seats
+        games = environments.count // seats
+        numbers = first + np.arange(games)  # of the episodes
+        running = RunningEpisodes(environments.spaces, self._runtime, environments.count)
         running.observe(observed)
-        results.returns[numbers[playing]] += rewards[playing]
-        results.lengths[numbers[playing]] += 1
-        ended = playing & (terminated | truncated if observed.over is None else observed.over)
-        results.ended[numbers[ended]] = True
-        playing &= ~ended
-        if progress(int(results.ended.sum()), results.mean_return):
-            return False
-        if not playing.any():
-            break
-    return True
+        playing = numbers < len(self._returns)
+        for _ in range(longest):
+            choice = running.act(noise.draw(), np.repeat(playing, seats))
+            actions = {name: values[: environments.count] for name, values in choice.actions.items()}
+            observed, rewards, terminated, truncated = environments.step(actions)
+            rewards = rewards if seats == 1 else rewards.reshape(games, seats).mean(axis=1)
+            refuse_unfit_rewards(rewards[playing], numbers[playing])
+            running.observe(observed)
+            self._returns[numbers[playing]] += rewards[playing]
+            self._lengths[numbers[playing]] += 1
+            ended = playing & (terminated | truncated if observed.over is None else observed.over)
+            self._ended[numbers[ended]] = True
+            playing &= ~ended
+            mean = float(self._returns[self._ended].mean()) if self._ended.any() else float("nan")
+            if self._progress(int(self._ended.sum()), mean):
+                return False
+            if not playing.any():
+                break
+        return True
+
+    def results(self) -> Evaluation:
+        """Return the results of the episodes that began."""
+        _refuse_unfit_returns(self._returns)
+        played = self._lengths > 0
+        return Evaluation(returns=self._returns[played], lengths=self._lengths[played], cut=~self._ended[played])
