@@ -71,28 +71,40 @@ class EnvironmentFactory:
         late_rendered = registered.entry_point == _CAR_RACING and spec.wrap is None
         if late_rendered:
             registered = _late_rendered(registered, spec.backend)
+        environment = self._make(registered, kwargs)
+        _check_limit(environment, spec)
+        if "minigrid.minigrid_env" in sys.modules:
+            from daedalus.actor.environments import minigrid_views  # needs an optional package
+
+            minigrid_views.speed_up(environment)
+        environment = self._in_wrappers(atari.wrapped(environment, of_atari))
+        if late_rendered:
+            from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages
+
+            environment = RenderObservation(environment)
+        return OneEpisode(environment) if self.one_episode else environment
+
+    def _make(self, registered: EnvSpec, kwargs: dict[str, Any]) -> gymnasium.Env:
+        name = self.spec.id
         try:
             # The checker costs a tenth of the speed, and warns only authors.
-            environment = gymnasium.make(registered, disable_env_checker=True, **kwargs)
+            return gymnasium.make(registered, disable_env_checker=True, **kwargs)
         except TypeError as error:
             if "must inherit from the gymnasium.Env" in str(error):
                 raise EnvironmentSetupError(
-                    f"environment {spec.id} is no gymnasium.Env: if it is a game of PettingZoo's with several agents, "
+                    f"environment {name} is no gymnasium.Env: if it is a game of PettingZoo's with several agents, "
                     "add --set environment.backend=pettingzoo"
                 ) from None
             if self.render_mode is None or "keyword argument 'render_mode'" not in str(error):
                 raise
             reason = "its constructor has no argument render_mode"
             raise EnvironmentSetupError(
-                f"environment {spec.id} cannot render {self.render_mode} images: {reason}"
+                f"environment {name} cannot render {self.render_mode} images: {reason}"
             ) from None
-        _check_limit(environment, spec)
-        if "minigrid.minigrid_env" in sys.modules:
-            from daedalus.actor.environments import minigrid_views  # needs an optional package
 
-            minigrid_views.speed_up(environment)
-        environment = atari.wrapped(environment, of_atari)
-        below = None
+    def _in_wrappers(self, environment: gymnasium.Env) -> gymnasium.Env:
+        """Return an environment in the wrappers of the specification."""
+        spec, below = self.spec, None
         if spec.wrap is not None:
             if self.camera is not None:
                 environment = below = CountedSteps(environment)
@@ -104,21 +116,17 @@ class EnvironmentFactory:
         masks = {}
         if spec.action_repeat > 1 and has_choices(environment.action_space, spec):
             masks["is_legal"] = LegalRepeats(spec, environment.observation_space, environment.action_space)
-        if spec.action_repeat > 1 or spec.no_reward_limit is not None or self.camera is not None:
-            environment = RepeatedSteps(
-                environment,
-                spec.id,
-                repeat=spec.action_repeat,
-                no_reward_limit=spec.no_reward_limit,
-                camera=self.camera,
-                below=below,
-                **masks,
-            )
-        if late_rendered:
-            from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages
-
-            environment = RenderObservation(environment)
-        return OneEpisode(environment) if self.one_episode else environment
+        if spec.action_repeat == 1 and spec.no_reward_limit is None and self.camera is None:
+            return environment
+        return RepeatedSteps(
+            environment,
+            spec.id,
+            repeat=spec.action_repeat,
+            no_reward_limit=spec.no_reward_limit,
+            camera=self.camera,
+            below=below,
+            **masks,
+        )
 
     def uses_vector_entry_point(self, registered: EnvSpec) -> bool:
         """Return whether the environment's own vector entry point can be used: it has one, and needs no wrapper."""
