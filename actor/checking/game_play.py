@@ -56,7 +56,7 @@ def check_game(
         report = EnvironmentReport(spaces=environments.spaces, seats=environments.seats)
         if seconds == 0.0:
             return report
-        report = report.model_copy(update=_played(environments, games, spec, seconds, env_steps, seed))
+        report = report.model_copy(update=_Play(environments, games, spec).play(seconds, env_steps, seed))
         for bot in bots:
             _play_bot(environments, games, bot, modules, seed)
         is_slow = time.monotonic() - began > 2.0 * seconds + 1.0  # to make others could take as long
@@ -71,87 +71,107 @@ def check_game(
             games.close()
 
 
-def _played(
-    environments: TransformedEnvironment,
-    games: GameEnvironments,
-    spec: EnvironmentSpec,
-    seconds: float,
-    env_steps: int,
-    seed: int,
-) -> dict[str, Any]:
-    """Return the fields of the report that playing tells. Raises EnvironmentSetupError for a problem."""
-    random = RandomActions(environments.spaces.actions, seed)
-    space = without(games.observation_space, spec.leave_out)
-    batch = batch_space(games.observation_space, games.count)
-    warnings: dict[str, str] = {}
-    precision = [Precision(space) for _ in range(games.count)]  # of each seat
-    maxima = byte_maxima(environments.spaces)
-    began = time.monotonic()
-    observed = environments.reset(seed)
-    before, still = {name: frames.copy() for name, frames in observed.frames.items()}, StillObservations()
-    reset_seconds, busy = time.monotonic() - began, 0.0
-    lengths, returns, steps, length, total = [], [], 0, 0, np.zeros(games.count)
-    together, differ = 0, False  # steps that show several agents something new; whether they ever observe another
-    until, stepping = time.monotonic() + seconds, 0.0
-    while not steps or (steps < env_steps and time.monotonic() < until):
-        if steps < STEPS_FOR_MASKS and (text := _mask_warning(environments, games, observed)):
-            warnings.setdefault("a mask", f"environment {spec.id}: {text}")
-        chosen = random.choose_each(observed.masks, games.count)
-        began, began_busy = time.monotonic(), time.process_time()
-        observed, rewards, terminated, truncated = environments.step(chosen)
-        stepping, busy = stepping + time.monotonic() - began, busy + time.process_time() - began_busy
+class _Play:
+    """One copy of a game that is played with random actions, and what it has shown."""
+
+    def __init__(self, environments: TransformedEnvironment, games: GameEnvironments, spec: EnvironmentSpec) -> None:
+        self._environments, self._games, self._spec = environments, games, spec
+        self._space = without(games.observation_space, spec.leave_out)
+        self._batch = batch_space(games.observation_space, games.count)
+        self._warnings: dict[str, str] = {}  # the first of each kind
+        self._precision = [Precision(self._space) for _ in range(games.count)]  # of each seat
+        self._maxima = byte_maxima(environments.spaces)
+        self._still = StillObservations()
+        self._together, self._differ = 0, False  # steps that show several agents something new; whether they differ
+        self._before: dict[str, np.ndarray] = {}  # the newest observations
+        self._lengths, self._returns = list[int](), list[float]()
+        self._steps, self._length, self._total = 0, 0, np.zeros(games.count)
+
+    def play(self, seconds: float, env_steps: int, seed: int) -> dict[str, Any]:
+        """Return the fields of the report that playing tells. Raises EnvironmentSetupError for a problem."""
+        random = RandomActions(self._environments.spaces.actions, seed)
+        began = time.monotonic()
+        observed = self._environments.reset(seed)
+        self._remember(observed)
+        reset_seconds, busy, stepping = time.monotonic() - began, 0.0, 0.0
+        until = time.monotonic() + seconds
+        while not self._steps or (self._steps < env_steps and time.monotonic() < until):
+            if self._steps < STEPS_FOR_MASKS and (text := _mask_warning(self._environments, self._games, observed)):
+                self._warn("a mask", text)
+            chosen = random.choose_each(observed.masks, self._games.count)
+            began, began_busy = time.monotonic(), time.process_time()
+            observed, rewards, terminated, truncated = self._environments.step(chosen)
+            stepping, busy = stepping + time.monotonic() - began, busy + time.process_time() - began_busy
+            self._take(observed, rewards, terminated | truncated)
+        self._conclude()
+        return {
+            "warnings": tuple(self._warnings.values()),
+            "env_steps": self._steps,
+            "step_seconds": stepping / self._steps,
+            "busy_share": min(busy / max(stepping, 1e-9), 1.0),
+            "reset_seconds": reset_seconds,
+            "lengths": tuple(self._lengths),
+            "returns": tuple(self._returns),
+            "byte_maxima": {name: tuple(map(int, each)) for name, each in self._maxima.items()},
+        }
+
+    def _warn(self, kind: str, text: str) -> None:
+        self._warnings.setdefault(kind, f"environment {self._spec.id}: {text}")
+
+    def _remember(self, observed: Observed) -> None:
+        self._before = {name: frames.copy() for name, frames in observed.frames.items()}
+
+    def _take(self, observed: Observed, rewards: np.ndarray, ended: np.ndarray) -> None:
+        """Examine a step."""
         assert observed.acting is not None
         assert observed.over is not None
-        steps, length, total = steps + 1, length + 1, total + rewards
-        _refuse_unfit(games, spec, observed.frames, rewards)
-        for name, largest in maxima.items():
+        self._steps, self._length, self._total = self._steps + 1, self._length + 1, self._total + rewards
+        _refuse_unfit(self._games, self._spec, observed.frames, rewards)
+        for name, largest in self._maxima.items():
             np.maximum(largest, observed.frames[name].reshape(-1, len(largest)).max(0), out=largest)
-        goes_on = observed.acting & ~(terminated | truncated) & (length > 0)  # no step that only resets
-        still.add({name: np.stack([frames, observed.frames[name]]) for name, frames in before.items()}, goes_on[None])
+        goes_on = observed.acting & ~ended & (self._length > 0)  # no step that only resets
+        pairs = {name: np.stack([frames, observed.frames[name]]) for name, frames in self._before.items()}
+        self._still.add(pairs, goes_on[None])
         seats = np.flatnonzero(observed.acting)
-        if len(seats) > 1 and not differ:
-            together += any((frames != before[name]).any() for name, frames in observed.frames.items())
-            differ = any((frames[seats] != frames[seats[0]]).any() for frames in observed.frames.values())
-        before = {name: frames.copy() for name, frames in observed.frames.items()}
-        if steps <= _LOOKED_AT:
-            for seat, row in enumerate(iterate(batch, games.observations)):
-                if observed.acting[seat]:
-                    precision[seat].add(row, starts=length == 0)
-                    precision[seat].add_reward(rewards[seat])
-                    for kind, text in observation_violations(space, row, "the game"):
-                        if kind == "problem":
-                            raise EnvironmentSetupError(f"environment {spec.id}: {text}")
-                        warnings.setdefault(kind, f"environment {spec.id}: {text}")
-        for seat in np.flatnonzero(terminated | truncated):
-            if text := unreported(games.infos[seat]):
-                warnings.setdefault("a number", f"environment {spec.id}: {text}")
+        if len(seats) > 1 and not self._differ:
+            self._together += any((frames != self._before[name]).any() for name, frames in observed.frames.items())
+            self._differ = any((frames[seats] != frames[seats[0]]).any() for frames in observed.frames.values())
+        self._remember(observed)
+        if self._steps <= _LOOKED_AT:
+            self._look(seats.tolist(), rewards)
+        for seat in np.flatnonzero(ended):
+            if text := unreported(self._games.infos[seat]):
+                self._warn("a number", text)
         if observed.over[0]:
-            lengths.append(length)
-            returns.append(float(total.mean()))
-            length, total = -1, np.zeros(games.count)  # the next step only resets
-    for seen in precision:
-        for name, text in seen.warnings.items():
-            warnings.setdefault(
-                f"precision of {name}", f"environment {spec.id}: {text.replace(_WRAPPER, 'in the game')}"
+            self._lengths.append(self._length)
+            self._returns.append(float(self._total.mean()))
+            self._length, self._total = -1, np.zeros(self._games.count)  # the next step only resets
+
+    def _look(self, seats: Sequence[int], rewards: np.ndarray) -> None:
+        """Compare what the seats that act observe with their space."""
+        rows = list(iterate(self._batch, self._games.observations))
+        for seat in seats:
+            self._precision[seat].add(rows[seat], starts=self._length == 0)
+            self._precision[seat].add_reward(rewards[seat])
+            for kind, text in observation_violations(self._space, rows[seat], "the game"):
+                if kind == "problem":
+                    raise EnvironmentSetupError(f"environment {self._spec.id}: {text}")
+                self._warn(kind, text)
+
+    def _conclude(self) -> None:
+        """Add the warnings that all steps together give."""
+        for seen in self._precision:
+            for name, text in seen.warnings.items():
+                self._warn(f"precision of {name}", text.replace(_WRAPPER, "in the game"))
+        if text := self._still.text(len(self._lengths)):
+            self._warn("still", text)
+        if self._together >= _FEWEST_TOGETHER and not self._differ:
+            self._warn(
+                "alike",
+                f"all agents that act observe the same in all of {self._together:,} rows, so that one policy cannot "
+                "know which of them it plays: let it observe that (--set environment.agent_ids=true), unless they are "
+                "to do the same",
             )
-    if text := still.text(len(lengths)):
-        warnings["still"] = f"environment {spec.id}: {text}"
-    if together >= _FEWEST_TOGETHER and not differ:
-        warnings["alike"] = (
-            f"environment {spec.id}: all agents that act observe the same in all of {together:,} rows, so that one "
-            "policy cannot know which of them it plays: let it observe that (--set environment.agent_ids=true), unless "
-            "they are to do the same"
-        )
-    return {
-        "warnings": tuple(warnings.values()),
-        "env_steps": steps,
-        "step_seconds": stepping / steps,
-        "busy_share": min(busy / max(stepping, 1e-9), 1.0),
-        "reset_seconds": reset_seconds,
-        "lengths": tuple(lengths),
-        "returns": tuple(returns),
-        "byte_maxima": {name: tuple(map(int, each)) for name, each in maxima.items()},
-    }
 
 
 _ROUNDING = 1e-3  # relative, of sums of rewards
