@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from daedalus.gateway import client_messages
-from daedalus.gateway.channel import HELLO_SECONDS, SEND_SECONDS, channel_of
+from daedalus.gateway.channel import HELLO_SECONDS
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.client_messages import (
@@ -22,6 +22,7 @@ from daedalus.gateway.client_messages import (
     Reward,
     State,
 )
+from daedalus.gateway.conversation_end import Connection
 from daedalus.gateway.places import Places
 from daedalus.gateway.security import MESSAGES_BURST, MESSAGES_PER_SECOND, Guard, RateLimit
 
@@ -30,10 +31,9 @@ _logger = logging.getLogger(__name__)
 _MAX_UNANSWERED = 8  # messages of one client; then reading pauses
 _MAX_EARLY = 2  # messages of one client that are read before it is admitted
 _MAX_FAULTS = 10  # of one client; then it is disconnected
-_OK, _FAULT, _TRY_LATER = 1000, 1008, 1013  # codes of RFC 6455
 
 
-class ClientConnection:
+class ClientConnection(Connection):
     """The conversation with one client.
 
     The hello is read as ASGI has it. After it each message is answered as it arrives, without a switch of tasks: that
@@ -44,13 +44,11 @@ class ClientConnection:
         self, gateway: "asyncio.Future[Gateway]", guard: Guard, places: Places, scope: Any, receive: Any, send: Any
     ) -> None:
         """`gateway` has its result when the network is reached."""
+        super().__init__(scope, send)
         self._reached, self._guard, self._places, self._scope = gateway, guard, places, scope
-        self._receive_event, self._send_event = receive, send
-        self._channel = channel_of(scope)
+        self._receive_event = receive
         self._states: dict[str, State] = {"": "new"}  # of the seats of the client's match; without one of the client
         self._as_text = True
-        self._end: ClientError | str | None = None  # why the gateway ends the connection
-        self._task: asyncio.Task[Any] | None = None
         self._gateway: Gateway | None = None  # while messages are answered
         self._actors: dict[str, ClientActor] = {}  # by seat
         self._unanswered: deque[str | bytes] = deque()
@@ -62,26 +60,11 @@ class ClientConnection:
 
     async def serve(self) -> None:
         """Serve the client until it disconnects, the run ends, or it breaks the rules too often."""
-        self._task = asyncio.current_task()
-        await self._receive_event()  # the request to connect
-        await self._send_event({"type": "websocket.accept"})
-        try:
-            await self._converse()
-        except asyncio.CancelledError:
-            if self._end is None or self._task is None:
-                raise
-            self._task.uncancel()
-            await self._finish(self._end)
-        except ClientError as error:
-            await self._finish(error)
-
-    def end(self, reason: ClientError | str) -> None:
-        """End the connection, with an error or with how the run ended. Idempotent. See Gateway.admit."""
-        if self._end is None and self._task is not None:
-            self._end = reason
-            self._task.cancel()
+        await self._until_end(self._converse())
 
     async def _converse(self) -> None:
+        await self._receive_event()  # the request to connect
+        await self._send_event({"type": "websocket.accept"})
         try:
             async with asyncio.timeout(HELLO_SECONDS):
                 event = await self._receive_event()
@@ -235,17 +218,8 @@ class ClientConnection:
         if self._unanswered or self._held is not None:
             self._go_on()
 
+    async def _send(self, message: dict[str, Any]) -> None:
+        self._write(message)
+
     def _write(self, message: dict[str, Any]) -> None:
         self._channel.write(client_messages.encode(message, as_text=self._as_text))
-
-    async def _finish(self, reason: ClientError | str) -> None:
-        """Say why the connection ends, and close it."""
-        self._channel.settle(False)
-        if isinstance(reason, str):
-            message, code = client_messages.run_ended(reason), _OK
-        else:
-            message, code = client_messages.error(reason), _TRY_LATER if reason.code == "unavailable" else _FAULT
-        with contextlib.suppress(TimeoutError, OSError):  # OSError: the client is gone
-            async with asyncio.timeout(SEND_SECONDS):
-                self._write(message)
-                await self._send_event({"type": "websocket.close", "code": code})

@@ -8,8 +8,9 @@ import time
 from collections.abc import AsyncGenerator
 from typing import Any, Literal, NamedTuple
 
-from daedalus.gateway.channel import HELLO_SECONDS, SEND_SECONDS, channel_of
+from daedalus.gateway.channel import HELLO_SECONDS
 from daedalus.gateway.client_messages import ClientError
+from daedalus.gateway.conversation_end import Connection
 from daedalus.gateway.security import OPERATOR, Guard, RateLimit
 from daedalus.gateway.watching import page_data
 from daedalus.gateway.watching.page_data import Observation, PageData
@@ -97,15 +98,14 @@ _logger = logging.getLogger(__name__)
 
 _MAX_FAULTS = 5  # of one page; then it is disconnected
 _RATE, _BURST = 2.0, 20.0  # messages of one page a second
-_FAULT, _TRY_LATER = 1008, 1013  # codes of RFC 6455
 
 
-class ViewerConnection:
+class ViewerConnection(Connection):
     """The conversation with one page. It receives what has changed, and no more than it can take."""
 
     def __init__(self, data: PageData, guard: Guard, scope: Any, receive: Any, send: Any) -> None:
-        self._data, self._guard, self._receive, self._send_event = data, guard, receive, send
-        self._channel = channel_of(scope)
+        super().__init__(scope, send)
+        self._data, self._guard, self._receive = data, guard, receive
         self._rate = RateLimit(_RATE, _BURST)
         self._sent: Observation | None = None
         self._camera: asyncio.Task[None] | None = None
@@ -113,17 +113,17 @@ class ViewerConnection:
         self._orders = new_orders()  # for the match
         self._owner = ""  # of the page's places
         self._telling: asyncio.Task[None] | None = None  # why a match ended
-        self._task: asyncio.Task[Any] | None = None
         self._reads_folder = False
-        self._end: ClientError | None = None  # why the gateway ends the connection
 
     async def serve(self) -> None:
         """Serve the page until it is closed."""
-        self._task = asyncio.current_task()
+        await self._until_end(self._take_part())
+
+    async def _take_part(self) -> None:
         await self._receive()  # the request to connect
         self._channel.limit(MAX_BYTES)
         await self._send_event({"type": "websocket.accept"})
-        try:
+        with contextlib.suppress(OSError, EOFError):  # the page is closed
             owner = await self._greet()
             is_operator = owner.startswith(OPERATOR)
             self._reads_folder = bool(owner)  # without a token: whoever reaches the gateway; a run directory is private
@@ -135,21 +135,6 @@ class ViewerConnection:
                     await self._converse()
             finally:
                 self._data.on_watch(self._data.is_watched)
-        except ClientError as error:
-            await self._finish(error)
-        except asyncio.CancelledError:
-            if self._end is None or self._task is None:
-                raise
-            self._task.uncancel()
-            await self._finish(self._end)
-        except (OSError, EOFError):
-            pass  # the page is closed
-
-    def end(self, reason: ClientError) -> None:
-        """End the connection: another page needs its place. Idempotent."""
-        if self._end is None and self._task is not None:
-            self._end = reason
-            self._task.cancel()
 
     async def _greet(self) -> str:
         """Return the owner of the page's token."""
@@ -245,16 +230,6 @@ class ViewerConnection:
     async def _tell(self, reason: ClientError) -> None:
         with contextlib.suppress(OSError):  # the page is closed
             await self._send({"type": "refused", "reason": reason.reason})
-
-    async def _finish(self, error: ClientError) -> None:
-        """Say why the connection ends, and close it."""
-        self._channel.settle(False)
-        code = _TRY_LATER if error.code == "unavailable" else _FAULT
-        message = {"type": "error", "code": error.code, "reason": error.reason}
-        with contextlib.suppress(TimeoutError, OSError):
-            async with asyncio.timeout(SEND_SECONDS):
-                await self._send(message)
-                await self._send_event({"type": "websocket.close", "code": code})
 
     # ----------------------------------------------------------------------------------------- from the page
 
