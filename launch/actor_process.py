@@ -193,7 +193,7 @@ def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, s
     while True:
         try:
             credentials = credentials_to_connect(options.connect, options.tls, "actor")
-            config, seatings = options.config(credentials), options.seatings(credentials)
+            actor = _Actor(options, credentials, stop)
             break
         except (ValueError, *SECURITY_ERRORS) as error:
             if not (options.stay and isinstance(error, NotValidNowError)):
@@ -201,14 +201,14 @@ def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, s
                 return status_at_start(error)
             if retries.wait(str(error)):
                 return 0
-    context["actor"] = config.name
+    context["actor"] = actor.name
 
     def note(welcome: Welcome) -> None:
         context.update(run=welcome.run, epoch=f"{welcome.learner_epoch:x}")
 
     while True:
         try:
-            finished = _serve_run(options, config, seatings, credentials, stop, leave, note)
+            finished = actor.take_part(leave, note)
         except Exception as error:  # broad: see _is_of_others
             if not options.stay or not _is_of_others(error):
                 if not isinstance(error, _REPORTED):
@@ -226,7 +226,6 @@ def run_actor(options: ActorOptions, stop: threading.Event, context: dict[str, s
             stopped = stop.wait(_NEXT_RUN_SECONDS)
         if stopped:
             return 0
-        config = replace(config, incarnation=secrets.randbits(62))
 
 
 def _is_of_others(error: Exception) -> bool:
@@ -243,34 +242,40 @@ def _is_of_others(error: Exception) -> bool:
     )
 
 
-def _serve_run(
-    options: ActorOptions,
-    config: ActorConfig,
-    seatings: Sequence[Seating],
-    credentials: Credentials | None,
-    stop: threading.Event,
-    leave: LeaveRequest,
-    on_join: Callable[[Welcome], None],
-) -> bool:
-    """Take part in one run, or in those of the seats; return whether they finished. Raises what `main` reports."""
-    config = replace(config, searched_since=time.monotonic())
-    with ExitStack() as stack:
+class _Actor:
+    """One actor. It takes part in a run at a time, or in those of its seats, each time as another incarnation."""
 
-        def connect() -> Transport:
-            transport = connect_with_retry(options.connect, stop, config.timeout, credentials)
-            if transport is None:
-                raise _StoppedError
-            return stack.enter_context(closing(transport))
+    def __init__(self, options: ActorOptions, credentials: Credentials | None, stop: threading.Event) -> None:
+        """Raises ValueError or CredentialsError with a message of one line."""
+        self._options, self._credentials, self._stop = options, credentials, stop
+        self._config, self._seatings = options.config(credentials), options.seatings(credentials)
 
-        try:
-            if seatings:
-                role = RoleActor(config, seatings, connect, stop)
-            else:
-                role = (Evaluator if options.evaluator else ActorService)(config, connect(), stop, on_join=on_join)
-        except _StoppedError:
-            return False
-        with leave.reaching(role):
-            return role.run()
+    @property
+    def name(self) -> str:
+        """Name of the actor."""
+        return self._config.name
+
+    def take_part(self, leave: LeaveRequest, on_join: Callable[[Welcome], None]) -> bool:
+        """Take part until the run is over, or `stop` is set; return whether it finished. Raises what `main` reports."""
+        config = replace(self._config, incarnation=secrets.randbits(62), searched_since=time.monotonic())
+        with ExitStack() as stack:
+
+            def connect() -> Transport:
+                transport = connect_with_retry(self._options.connect, self._stop, config.timeout, self._credentials)
+                if transport is None:
+                    raise _StoppedError
+                return stack.enter_context(closing(transport))
+
+            try:
+                if self._seatings:
+                    role = RoleActor(config, self._seatings, connect, self._stop)
+                else:
+                    kind = Evaluator if self._options.evaluator else ActorService
+                    role = kind(config, connect(), self._stop, on_join=on_join)
+            except _StoppedError:
+                return False
+            with leave.reaching(role):
+                return role.run()
 
 
 class _StoppedError(Exception):

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from log_lines import LINES
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError, NoLearnerError
+from daedalus.actor.session.actor_config import ActorConfig
 from daedalus.cli.commands import actor as command
 from daedalus.launch import actor_process
 from daedalus.launch.logs import LogOptions
@@ -35,17 +37,21 @@ def script(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What the attempts raise or return, one after the other; the pauses between them are short."""
     stop, left, incarnations = threading.Event(), list[Any](), set[int]()
 
-    def serve(_arguments: object, config: Any, *_: object) -> bool:
-        assert config.incarnation not in incarnations, "a quarantined incarnation stays quarantined"
-        incarnations.add(config.incarnation)
-        result = left.pop(0)
-        if isinstance(result, Exception):
-            raise result
-        return result
+    class ScriptedActor:
+        def __init__(self, config: ActorConfig, *_: object, **__: object) -> None:
+            assert config.incarnation not in incarnations, "a quarantined incarnation stays quarantined"
+            incarnations.add(config.incarnation)
+
+        def run(self) -> bool:
+            result = left.pop(0)
+            if isinstance(result, Exception):
+                raise result
+            return result
 
     monkeypatch.setattr(command, "stop_on_signals", lambda **_: stop)
     monkeypatch.setattr(LogOptions, "configure", lambda *_, **__: None)
-    monkeypatch.setattr(actor_process, "_serve_run", serve)
+    monkeypatch.setattr(actor_process, "connect_with_retry", lambda *_: ExitStack())
+    monkeypatch.setattr(actor_process, "ActorService", ScriptedActor)
     monkeypatch.setattr(actor_process, "_NEXT_RUN_SECONDS", 0.0)
     monkeypatch.setattr("daedalus.transport.retries._MAX_PAUSE_SECONDS", 0.001)
     monkeypatch.setattr("daedalus.transport.retries._FIRST_PAUSE_SECONDS", 0.001)
