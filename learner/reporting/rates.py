@@ -4,7 +4,8 @@ from collections import deque
 from dataclasses import dataclass
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.learner.serving.actor_state import Actor
+from daedalus.learner.serving.fleet import Fleet
 
 _WINDOW_SECONDS, _WINDOW_GROWTHS = 10.0, 4  # of a rate: the longer of the two
 _SPACING_SECONDS = 1.0  # between the moments at which a window may begin

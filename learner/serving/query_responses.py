@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable
 from typing import TypedDict
 
-from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.learner.serving.actor_state import Actor
+from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.run_context import RunContext
 from daedalus.learner.serving.waiting_requests import read_request
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of

@@ -22,7 +22,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from daedalus.learner.run.counters import updates_of
-from daedalus.learner.serving.fleet import NON_FINITE, Actor, Fault
+from daedalus.learner.serving.actor_state import NON_FINITE, Actor, Fault
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge, acknowledgement
 from daedalus.learner.serving.run_context import RunContext

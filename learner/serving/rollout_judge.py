@@ -12,7 +12,8 @@ import numpy as np
 
 from daedalus.learner.league.run_league import League
 from daedalus.learner.run.lesson_progress import lessons_violation
-from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.learner.serving.actor_state import Actor
+from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.upload_checks import (
     Shapes,
     first_component_violation,

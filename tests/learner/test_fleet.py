@@ -5,7 +5,8 @@ from building import SPACES, identity, joined_fleet
 
 from daedalus.learner.serving import fleet as fleet_module
 from daedalus.learner.serving import query_responses
-from daedalus.learner.serving.fleet import Fleet, RefusedJoins
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.refused_joins import RefusedJoins
 from daedalus.protocol.messages import PAGE_ACTORS, Join, Origin, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces
 

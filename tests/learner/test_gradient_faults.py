@@ -18,7 +18,7 @@ from building import (
 )
 
 from daedalus.algorithms.action_values import ActionValues
-from daedalus.learner.serving.fleet import NON_FINITE, Actor
+from daedalus.learner.serving.actor_state import NON_FINITE, Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.spec import PolicySpec, TrainingSpec

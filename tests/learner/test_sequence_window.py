@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daedalus.learner.serving.fleet import SequenceWindow
+from daedalus.learner.serving.actor_state import SequenceWindow
 
 WINDOW = 1024
 HUGE = 2**62

@@ -13,7 +13,7 @@ import pytest
 from daedalus.actor.session.snapshots import SnapshotFeed
 from daedalus.actor.session.uploading import InFlightRollouts
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.fleet import SequenceWindow
+from daedalus.learner.serving.actor_state import SequenceWindow
 from daedalus.learner.serving.rollout_judge import RolloutJudge
 from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.uploads import Rollout
