@@ -98,6 +98,31 @@ class PlainPolicy:
         return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
 
 
+class Always(PlainPolicy):
+    """A policy that always takes the same action."""
+
+    def __init__(self, action: int) -> None:
+        self.action = action
+
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See PlainPolicy."""
+        return np.full(len(observations), self.action), np.zeros(len(observations), np.float32), state
+
+
+class RowCounter(PlainPolicy):
+    """A policy that takes random actions, and whose memory counts the rows of the episode."""
+
+    state_size = 1
+
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See PlainPolicy."""
+        return (noise.uniform[:, 0] * 5).astype(np.int64), observations[:, 2].copy(), state + 1.0
+
+
 def plain(content: Any) -> Any:
     """Return the only component of a map."""
     (value,) = content.values()

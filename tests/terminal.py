@@ -1,8 +1,16 @@
 """A terminal that remembers its lines: what a person sees after a program has written escape sequences."""
 
+import io
 import re
 
 _SEQUENCE = re.compile(r"\x1b\[(\?25[hl]|\d*[A-Za-z]|[\d;]*m)")
+
+
+class TerminalStream(io.StringIO):
+    """Stream that is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
 
 
 class Terminal:

@@ -5,7 +5,6 @@ import json
 import os
 import random
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from processes import Running, processes_mentioning
+from processes import Running, free_address, processes_mentioning
 
 from benchmarks.running import COMMAND
 from daedalus.protocol import keys
@@ -31,13 +30,6 @@ _POLL_SECONDS = 0.02
 
 class FailedError(Exception):
     """Error of a service that did not behave as documented."""
-
-
-def free_address() -> str:
-    """Return a loopback address that no process listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Scene:

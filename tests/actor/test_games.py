@@ -15,7 +15,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.classic.tictactoe import tictactoe
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
-from plain import PlainPolicy
+from plain import Always, RowCounter
 
 from daedalus.actor.checking.check_report import EnvironmentReport
 from daedalus.actor.checking.play import check_environment
@@ -25,7 +25,6 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.learner.run.settings import SettingsError, run_spec
 from daedalus.learner.training.learner import Learner
-from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.league import MatchCount, Plan, PlannedOpponent, PlannedRating
@@ -33,19 +32,6 @@ from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec, LeagueSpec, PolicySpec, TrainingSpec
 
 ROLLOUTS = 6
-
-
-class Counting(PlainPolicy):
-    """A policy that takes random actions, and whose memory counts the rows of the episode."""
-
-    state_size = 1
-
-    def choose(
-        self, observations: np.ndarray, state: np.ndarray, noise: Noise
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See PlainPolicy."""
-        actions = (noise.uniform[:, 0] * 5).astype(np.int64)
-        return actions, observations[:, 2].copy(), state + 1.0
 
 
 @settings(max_examples=60, deadline=None)
@@ -68,7 +54,7 @@ def test_rows_of_each_seat_are_those_of_a_slow_account(
     sides = (tuple(names[:side]), tuple(names[side:])) if side < agents else ()
     opponents = {"random": share if sides else 0.0}
     league = LeagueSpec(past_share=0.0, opponents=opponents, rating_share=0.2, sides=sides)
-    collector = started_collector(spec, Counting(), count=copies, rollout_length=length, league=league)
+    collector = started_collector(spec, RowCounter(), count=copies, rollout_length=length, league=league)
     alone = copies - (round(share * copies) if sides else 0)  # the others play against an opponent
     accounts: dict[int, dict] = {}
     seen, members, results = set(), dict[tuple[int, int], set[int]](), list[MatchCount]()
@@ -165,7 +151,7 @@ def test_rows_after_random_openings_are_those_of_a_slow_account(
     spec = EnvironmentSpec(id=f"scripted_games:{kind}", backend="pettingzoo", kwargs={"seed": seed, "agents": agents})
     scripted_games.PLAYED.clear()
     league = LeagueSpec(past_share=0.0, opponents={}, rating_share=0.0, openings=openings)
-    collector = started_collector(spec, Counting(), rollout_length=20, league=league)
+    collector = started_collector(spec, RowCounter(), rollout_length=20, league=league)
     learned, steps, counted = set(), set[tuple[int, int]](), 0
     try:
         for _ in range(ROLLOUTS):
@@ -197,7 +183,7 @@ def test_rows_after_random_openings_are_those_of_a_slow_account(
 def test_openings_have_every_length_up_to_the_largest() -> None:
     spec = EnvironmentSpec(id="scripted_games:Together", backend="pettingzoo", kwargs={"seed": 1, "agents": 1})
     league = LeagueSpec(past_share=0.0, opponents={}, rating_share=0.0, openings=3)
-    collector = started_collector(spec, Counting(), count=8, rollout_length=100, league=league)
+    collector = started_collector(spec, RowCounter(), count=8, rollout_length=100, league=league)
     rollout = collect(collector)
     collector.close()
     matches, _, numbers = rollout.frames["observation"][:-1].transpose(2, 0, 1).astype(int)
@@ -209,21 +195,6 @@ def test_openings_have_every_length_up_to_the_largest() -> None:
     shares = np.bincount(firsts, minlength=4) / len(firsts)
     assert len(shares) == 4
     assert shares.min() > 0.05  # a match that ends in its opening begins again without one
-
-
-class Always(PlainPolicy):
-    """A policy that always takes the same action."""
-
-    def __init__(self, action: int) -> None:
-        super().__init__()
-        self._action = action
-
-    def choose(
-        self, observations: np.ndarray, state: np.ndarray, noise: Noise
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See PlainPolicy."""
-        count = len(observations)
-        return np.full(count, self._action), np.zeros(count, np.float32), state
 
 
 def test_policies_of_opponents_play_their_seats_alone_and_lose() -> None:

@@ -7,33 +7,18 @@ import pytest
 import scripted_games
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain import PlainPolicy
+from plain import Always
 
 from daedalus.actor.environments.games import make_games
 from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.actor.evaluation.matches import MatchPlan, MatchResults, play_matches
 from daedalus.learner.training.learner import Learner
-from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.league import wilson_interval
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
 
 MODULES = UserModules(frozenset({"scripted_games"}))
-
-
-class Always(PlainPolicy):
-    """A policy that takes one action always."""
-
-    def __init__(self, action: int) -> None:
-        super().__init__()
-        self.action = action
-
-    def choose(
-        self, observations: np.ndarray, state: np.ndarray, noise: Noise
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See PlainPolicy."""
-        return np.full(len(observations), self.action), np.zeros(len(observations), np.float32), state
 
 
 class AlwaysBot:

@@ -11,14 +11,13 @@ import scripted_games
 from collectors import IDENTITY, snapshot
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from plain import PlainPolicy
+from plain import RowCounter
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.roles import agents_named, roles_of
 from daedalus.actor.environments.shared_games import SharedGames
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.role_actor import RoleCollector
-from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import ActorSpec, RunSpec
 from daedalus.protocol.uploads import Rollout
@@ -29,18 +28,6 @@ LONGEST_SECONDS = 60.0  # for a test on a busy machine: more is a wait for ever
 
 class OverError(Exception):
     """The run of these seats is over."""
-
-
-class Counting(PlainPolicy):
-    """A policy that takes random actions, and whose memory counts the rows of the episode."""
-
-    state_size = 1
-
-    def choose(
-        self, observations: np.ndarray, state: np.ndarray, noise: Noise
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See PlainPolicy."""
-        return (noise.uniform[:, 0] * 5).astype(np.int64), observations[:, 2].copy(), state + 1.0
 
 
 def run_spec(kind: str, seed: int, agents: int, plays: tuple[str, ...], **changes: Any) -> ActorSpec:
@@ -126,7 +113,7 @@ def test_runs_that_share_games_get_the_rows_of_their_own_seats(
                     time.sleep(random.random() * 0.01)
                 if random.random() < 0.5 or not collector.has_policy:
                     collector.prepare(spec)
-                    collector.begin(Counting(), spec, seed=1)
+                    collector.begin(RowCounter(), spec, seed=1)
                     collector.load(snapshot(0, {}))
                 rollout = collector.collect(IDENTITY, on_row)
                 check_rows(rollout, seed, agents, runs[run], first_copy, together=kind == "Together")
@@ -202,7 +189,7 @@ def test_a_failure_of_the_game_ends_all_runs(monkeypatch: pytest.MonkeyPatch) ->
     def play(run: str, agent: str) -> None:
         collector, spec = RoleCollector(games, run, modules=MODULES), run_spec("Together", 7, 2, (agent,))
         collector.prepare(spec)
-        collector.begin(Counting(), spec, seed=1)
+        collector.begin(RowCounter(), spec, seed=1)
         collector.load(snapshot(0, {}))
         with pytest.raises(EnvironmentSetupError) as raised:
             collector.collect(IDENTITY)
@@ -228,12 +215,12 @@ def test_a_run_that_returns_with_other_settings_is_refused() -> None:
     games, spec = SharedGames({"one": plays}, modules=MODULES), run_spec("Together", 7, 2, plays)
     collector = RoleCollector(games, "one", modules=MODULES)
     collector.prepare(spec)
-    collector.begin(Counting(), spec, seed=1)
+    collector.begin(RowCounter(), spec, seed=1)
     collector.load(snapshot(0, {}))
     collector.collect(IDENTITY)
     for returns in (
         lambda: collector.prepare(run_spec("Together", 7, 2, plays, length=5)),
-        lambda: collector.begin(Counting(), spec, seed=1, epsilon=0.5),
+        lambda: collector.begin(RowCounter(), spec, seed=1, epsilon=0.5),
     ):
         with pytest.raises(ActorError, match="'one' has other settings than before"):
             returns()

@@ -13,6 +13,7 @@ from typing import IO
 import pytest
 from planning import finish, planner
 from processes import LIMIT, processes_mentioning, until
+from terminal import TerminalStream
 
 from daedalus.analysis import sweep_execution
 from daedalus.analysis.sweep_execution import (
@@ -200,15 +201,10 @@ def test_the_reason_of_a_failure_is_what_the_run_said(tmp_path: Path, output: st
     assert reason(tmp_path / "log", 7) == expected
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
 def test_a_terminal_shows_the_runs_in_one_line(tmp_path: Path) -> None:
     (run,) = grid(tmp_path, ["5"], 1).planned
     finish(run, env_steps=150_000)
-    stream = Terminal()
+    stream = TerminalStream()
     display = Display(stream, 4)
     display.show(2, 1, [run])
     assert "2 of 4 runs  1 failed  left -  rollout_length-5_seed-1 10 % return 480.0" in stream.getvalue()

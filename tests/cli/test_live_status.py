@@ -13,7 +13,7 @@ from log_lines import LINES
 from processes import LIMIT, until
 from recorded_runs import record
 from statuses import actor_status, run_status
-from terminal import Terminal
+from terminal import Terminal, TerminalStream
 
 from daedalus.analysis.run_selection import change_tag
 from daedalus.cli import screen
@@ -57,18 +57,13 @@ class Learner:
         return MemoryTransport(self.network)
 
 
-class Tty(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
 @pytest.fixture
-def tty(monkeypatch: pytest.MonkeyPatch) -> Tty:
+def tty(monkeypatch: pytest.MonkeyPatch) -> TerminalStream:
     for name, value in {"COLUMNS": "100", "LINES": "20", "TERM": "xterm"}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(screen, "_LOOK_SECONDS", 0.01)
     monkeypatch.setattr(screen, "_FIRST_SECONDS", 0.0)
-    return Tty()
+    return TerminalStream()
 
 
 def seen(stream: io.StringIO) -> str:
@@ -109,7 +104,7 @@ def test_looks_are_empty_until_a_learner_answers_and_after_it_has_gone() -> None
     stop.set()
 
 
-def test_status_watch_redraws_a_frame_until_ctrl_c(tty: Tty, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_watch_redraws_a_frame_until_ctrl_c(tty: TerminalStream, monkeypatch: pytest.MonkeyPatch) -> None:
     learner, frames = Learner(), []
 
     class Interrupted(Screen):
@@ -171,12 +166,12 @@ def test_watch_shows_nothing_but_the_state(option: str, capsys: pytest.CaptureFi
 
 
 @pytest.fixture
-def display(tty: Tty) -> TrainingDisplay:
+def display(tty: TerminalStream) -> TrainingDisplay:
     return TrainingDisplay(Screen(tty, tty), "mine")
 
 
 def test_train_shows_its_run_and_at_the_end_a_short_frame(
-    display: TrainingDisplay, tty: Tty, monkeypatch: pytest.MonkeyPatch
+    display: TrainingDisplay, tty: TerminalStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learner = Learner()
     monkeypatch.setattr("daedalus.transport.connecting.connect", learner.connect)

@@ -7,17 +7,10 @@ from typing import Any
 
 import pytest
 from statuses import actor_status, run_status
-from terminal import Terminal
+from terminal import Terminal, TerminalStream
 
 from daedalus.cli.run_watcher import WatchedRun
 from daedalus.cli.screen import Screen
-
-
-class Tty(io.StringIO):
-    """Stream that is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +34,7 @@ def seen(stream: io.StringIO) -> Terminal:
 
 
 def test_lines_appear_above_the_newest_frame() -> None:
-    stream = Tty()
+    stream = TerminalStream()
     screen = Screen(stream, stream)
     screen.out("before")
     screen.show([run(100, actors=3)])
@@ -64,7 +57,7 @@ def test_lines_appear_above_the_newest_frame() -> None:
 
 
 def test_no_line_is_torn_by_frames_of_another_thread() -> None:
-    stream = Tty()
+    stream = TerminalStream()
     screen = Screen(stream, stream)
     screen.show([run(0)])
 
@@ -87,7 +80,7 @@ def test_no_line_is_torn_by_frames_of_another_thread() -> None:
 
 
 def test_a_long_line_is_whole_and_does_not_tear_the_frame() -> None:
-    stream = Tty()
+    stream = TerminalStream()
     screen = Screen(stream, stream)
     screen.show([run(100)])
     screen.out("x" * 100)
@@ -100,7 +93,7 @@ def test_a_long_line_is_whole_and_does_not_tear_the_frame() -> None:
 
 def test_the_cursor_is_never_hidden_for_long() -> None:
     """A process that is killed cannot show it again."""
-    stream = Tty()
+    stream = TerminalStream()
     screen = Screen(stream, stream)
     screen.show([run(100)])
     assert seen(stream).cursor_shown
@@ -108,7 +101,7 @@ def test_the_cursor_is_never_hidden_for_long() -> None:
 
 
 def test_the_end_of_training_leaves_a_short_frame() -> None:
-    stream = Tty()
+    stream = TerminalStream()
     screen = Screen(stream, stream)
     screen.show([run(100)])
     screen.end(run(200))
@@ -118,7 +111,7 @@ def test_the_end_of_training_leaves_a_short_frame() -> None:
 
 
 def test_standard_error_that_is_no_terminal_gets_its_lines() -> None:
-    out, err = Tty(), io.StringIO()
+    out, err = TerminalStream(), io.StringIO()
     screen = Screen(out, err)
     screen.show([run(100)])
     screen.err("trouble")
@@ -129,7 +122,7 @@ def test_standard_error_that_is_no_terminal_gets_its_lines() -> None:
 
 def test_colours_are_left_out_with_no_color(monkeypatch: pytest.MonkeyPatch) -> None:
     def colours() -> int:
-        stream = Tty()
+        stream = TerminalStream()
         screen = Screen(stream, stream)
         screen.show([WatchedRun(run_status(problems=("trouble",)))])
         screen.end()
@@ -142,17 +135,17 @@ def test_colours_are_left_out_with_no_color(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("term", ["dumb", "unknown"])
 def test_plain_lines_where_no_frame_can_be_shown(term: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Screen(Tty(), Tty()).shows_frames
-    assert not Screen(io.StringIO(), Tty()).shows_frames
+    assert Screen(TerminalStream(), TerminalStream()).shows_frames
+    assert not Screen(io.StringIO(), TerminalStream()).shows_frames
     with monkeypatch.context() as changed:
         changed.setattr(importlib.util, "find_spec", lambda name: None)
-        assert not Screen(Tty(), Tty()).shows_frames
+        assert not Screen(TerminalStream(), TerminalStream()).shows_frames
     monkeypatch.setenv("TERM", term)
-    assert not Screen(Tty(), Tty()).shows_frames
+    assert not Screen(TerminalStream(), TerminalStream()).shows_frames
 
 
 def test_a_closed_terminal_does_not_end_the_run() -> None:
-    class Closed(Tty):
+    class Closed(TerminalStream):
         def write(self, text: str) -> int:
             raise OSError("closed")
 

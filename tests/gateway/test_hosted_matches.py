@@ -1,7 +1,6 @@
 """A game engine that hosts matches and holds their seats over one WebSocket: rows, steps, and bad input."""
 
 import queue
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -80,14 +79,6 @@ class Engine(JsonClient):
                 last = [float(number), float(agent), float(taken[agent])]
                 fields = {"terminated": agent in step.terminated, "observation": last}
                 self.send("end_episode", seat=self.seats[agent], **fields)
-
-
-@pytest.fixture
-def gateway(network: MemoryNetwork) -> Iterator[RunningGateway]:
-    running = RunningGateway(network)
-    yield running
-    running.close()
-    assert running.failure is None
 
 
 def received(learner: ScriptedLearner) -> list[Rollout]:

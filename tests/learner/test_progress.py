@@ -6,18 +6,12 @@ from types import SimpleNamespace
 import pytest
 from league_statuses import LEAGUE
 from log_lines import LINES
+from terminal import TerminalStream
 
 from daedalus.learner.reporting.metrics_rows import league_columns
 from daedalus.learner.reporting.progress import Progress
 
 CLEAR = "\r\x1b[K"
-
-
-class Screen(io.StringIO):
-    """Stream that is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
 
 
 class Clock:
@@ -34,9 +28,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 @pytest.fixture
-def screen(monkeypatch: pytest.MonkeyPatch) -> Screen:
+def screen(monkeypatch: pytest.MonkeyPatch) -> TerminalStream:
     monkeypatch.setenv("COLUMNS", "200")
-    return Screen()
+    return TerminalStream()
 
 
 def row(env_steps: int, **known: float) -> dict[str, float]:
@@ -51,7 +45,7 @@ def row(env_steps: int, **known: float) -> dict[str, float]:
     }
 
 
-def test_line_is_rewritten_on_a_terminal(screen: Screen) -> None:
+def test_line_is_rewritten_on_a_terminal(screen: TerminalStream) -> None:
     progress = Progress(screen, 1000)
     progress.show(row(100))
     progress.show(row(200))
@@ -61,7 +55,7 @@ def test_line_is_rewritten_on_a_terminal(screen: Screen) -> None:
     assert "\n" not in screen.getvalue()
 
 
-def test_said_text_is_a_permanent_line_of_its_own(screen: Screen) -> None:
+def test_said_text_is_a_permanent_line_of_its_own(screen: TerminalStream) -> None:
     progress = Progress(screen, 1000)
     progress.say("one")
     progress.show(row(100))
@@ -73,7 +67,7 @@ def test_said_text_is_a_permanent_line_of_its_own(screen: Screen) -> None:
     assert lines[2:] == ["two", "three", ""]
 
 
-def test_end_terminates_the_rewritten_line_once(screen: Screen) -> None:
+def test_end_terminates_the_rewritten_line_once(screen: TerminalStream) -> None:
     progress = Progress(screen, 1000)
     progress.show(row(100))
     progress.end()
@@ -99,7 +93,7 @@ def test_log_gets_a_record_after_1_second_and_then_every_5_seconds_without_a_ter
     assert stream.getvalue() == "done\n"
 
 
-def test_line_shows_the_return_after_the_first_episode(screen: Screen) -> None:
+def test_line_shows_the_return_after_the_first_episode(screen: TerminalStream) -> None:
     progress = Progress(screen, 2_000_000)
     progress.show(row(1_500_000))
     assert "return       -" in screen.getvalue()
@@ -110,30 +104,30 @@ def test_line_shows_the_return_after_the_first_episode(screen: Screen) -> None:
 
 
 @pytest.mark.parametrize(("mean", "shown"), [(0.00012, "0.00012"), (-0.034, "-0.034"), (12_345_678.9, "12,345,679")])
-def test_line_shows_returns_of_any_size(mean: float, shown: str, screen: Screen) -> None:
+def test_line_shows_returns_of_any_size(mean: float, shown: str, screen: TerminalStream) -> None:
     Progress(screen, 2_000_000).show(row(1_500_000, episode_return_mean=mean))
     assert f"return {shown:>7}  " in screen.getvalue()
 
 
-def test_rates_are_unknown_before_the_first_batch(screen: Screen) -> None:
+def test_rates_are_unknown_before_the_first_batch(screen: TerminalStream) -> None:
     Progress(screen, 1000).show({"wall_seconds": 2.0, "env_steps": 0, "actors": 2})
     for part in ("       -/s  left      -  updates     -/s", "lag -  actors 2"):
         assert part in screen.getvalue()
 
 
-def test_what_the_first_batch_waits_for_stands_in_place_of_figures(screen: Screen) -> None:
+def test_what_the_first_batch_waits_for_stands_in_place_of_figures(screen: TerminalStream) -> None:
     waits_for = "the first batch waits for rollouts: actor-0 is at row 34 of 128"
     Progress(screen, 1000).show({"wall_seconds": 2.0, "env_steps": 0, "actors": 2}, waits_for)
     assert screen.getvalue().endswith(f"    2.0 s  {waits_for}  actors 2")
 
 
-def test_lag_is_shown_in_batches_where_a_batch_makes_several_updates(screen: Screen) -> None:
+def test_lag_is_shown_in_batches_where_a_batch_makes_several_updates(screen: TerminalStream) -> None:
     Progress(screen, 1000, 160).show(row(100, policy_lag_mean=160.0))
     assert "lag 1 batch (160 updates)" in screen.getvalue()
 
 
 @pytest.mark.parametrize("columns", [20, 60, 80, 100, 200])
-def test_line_fits_the_terminal(columns: int, screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_line_fits_the_terminal(columns: int, screen: TerminalStream, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
     Progress(screen, 2_000_000).show(row(1_500_000, episode_return_mean=-1234.5, episode_length_mean=1000.0))
     line = screen.getvalue().removeprefix(CLEAR)
@@ -142,14 +136,14 @@ def test_line_fits_the_terminal(columns: int, screen: Screen, monkeypatch: pytes
         assert (part in line) == (columns >= needed), part
 
 
-def test_small_rates_are_not_shown_as_0(screen: Screen) -> None:
+def test_small_rates_are_not_shown_as_0(screen: TerminalStream) -> None:
     Progress(screen, 10_000).show(row(464, env_steps_per_second=0.4, updates_per_second=0.0293))
     line = screen.getvalue().split(CLEAR)[-1]
     for part in ("    0.4/s", "left  6.6 h", "updates 0.029/s"):
         assert part in line
 
 
-def test_a_rating_stands_in_place_of_a_return_that_is_0_by_construction(screen: Screen) -> None:
+def test_a_rating_stands_in_place_of_a_return_that_is_0_by_construction(screen: TerminalStream) -> None:
     Progress(screen, 1000).show(row(100, episode_return_mean=0.0, **league_columns(LEAGUE)))
     assert "rating  1,312 +- 50  wins against my_bots.Greedy 75%, random 97%" in screen.getvalue()
     assert "return" not in screen.getvalue()
