@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.launch.environment_check import checked_defaults, checked_spaces, transformed_spaces
+from daedalus.launch.local_run import LocalRun
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.resuming import check_initial
@@ -208,11 +209,11 @@ def check_learner_installed() -> None:
         )
 
 
-def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Spaces | None]:
+def create_run(new: NewRun, *, started: float, fork: bool = False) -> tuple[RunLock, LocalRun]:
     """Check the environment of a new run, and create its directory.
 
-    `fork`: see quick_check. Return the lock of the directory, the specification, and the spaces, or None where the
-    check of the environment takes long. Raises SettingsError, EnvironmentProblemError or RunInUseError.
+    `fork`: see quick_check. Return the lock of the directory, and the run; without spaces where the check of the
+    environment takes long. Raises SettingsError, EnvironmentProblemError or RunInUseError.
     """
     check_learner_installed()
     if new.directory is not None:
@@ -220,7 +221,15 @@ def create_run(new: NewRun, *, fork: bool = False) -> tuple[RunLock, RunSpec, Sp
     check_initial(new.init_from, other_spaces=new.other_spaces)
     with Surroundings():  # which an algorithm of the user may change when it is imported
         spec, spaces = _prepared(new.choice, fork)
-    return *new.create(spec, new.directory or new.choice.directory(spec), spaces), spaces
+    lock, spec = new.create(spec, new.directory or new.choice.directory(spec), spaces)
+    return lock, LocalRun(
+        directory=lock.directory,
+        spec=spec,
+        started=started,
+        lock=lock.inheritable,
+        spaces=spaces,
+        init_from=new.init_from,
+    )
 
 
 def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:

@@ -139,19 +139,9 @@ def train(
     )
     with given.players() as start_player:
         with _checking(quiet):
-            lock, spec, spaces = create_run(new)
+            lock, run = create_run(new, started=started)
         with lock:
-            run = LocalRun(
-                directory=lock.directory,
-                spec=spec,
-                started=started,
-                lock=lock.inheritable,
-                spaces=spaces,
-                init_from=new.init_from,
-                log=trackers,
-                start_player=start_player,
-            )
-            return _trained(run, callback, quiet)
+            return _trained(replace(run, log=trackers, start_player=start_player), callback, quiet)
 
 
 def resume(

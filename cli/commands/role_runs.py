@@ -126,18 +126,11 @@ def _created(
                 # All on one side: they have no opponent in their own run.
                 fixed = [f"environment.agents={list(own)}", *([f"league.sides=[{list(own)}]"] if len(own) > 1 else [])]
                 choice = replace(choice, assignments=(*choice.assignments, *fixed))
-                lock, spec, spaces = create_run(
-                    replace(new, choice=choice, directory=run_directory.role_directory(parent, role)), fork=True
-                )
+                directory = run_directory.role_directory(parent, role)
+                own_run = replace(new, choice=choice, directory=directory)
+                lock, run = create_run(own_run, started=started, fork=True)
                 stack.enter_context(lock)
-                runs[role] = LocalRun(
-                    directory=lock.directory,
-                    spec=spec,
-                    started=started,
-                    lock=lock.inheritable,
-                    spaces=spaces,
-                    **machine_options(parsed, lock.directory),
-                )
+                runs[role] = replace(run, **machine_options(parsed, lock.directory))
             check_roles({role: run.spec for role, run in runs.items()})
         except BaseException:
             for run in runs.values():

@@ -116,7 +116,7 @@ def train(arguments: list[str]) -> int:
         print_error("train", error)
         return status_at_start(error)
     try:
-        lock, spec, spaces = create_run(new, fork=True)
+        lock, run = create_run(new, started=started, fork=True)
         if parsed.set_role:
             lock.close()
             run_directory.remove_failed(lock.directory)
@@ -132,15 +132,7 @@ def train(arguments: list[str]) -> int:
         print_error("train", error)
         return status_at_start(error)
     with lock:
-        run = LocalRun(
-            directory=lock.directory,
-            spec=spec,
-            started=started,
-            lock=lock.inheritable,
-            spaces=spaces,
-            init_from=new.init_from,
-            **machine_options(parsed, lock.directory),
-        )
+        run = replace(run, **machine_options(parsed, lock.directory))
         return _run(run, screen, lock, exits_with_parent=parsed.exit_with_parent)
 
 
