@@ -22,6 +22,7 @@ from daedalus.analysis.run_groups import Group, select, short
 from daedalus.analysis.statistics import interquartile_mean
 from daedalus.analysis.sweep_plan import PlannedRun, has_begun, is_done
 from daedalus.analysis.sweep_search import Search
+from daedalus.launch.process_lifecycle import FINISHED
 from daedalus.launch.supervision import stop
 from daedalus.learner.run.run_directory import METRICS, SUMMARY, read_json, remove_failed
 from daedalus.learner.run.run_files import RunDataError
@@ -29,7 +30,6 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.regular_files import replacing
 from daedalus.protocol.texts import one_line, short_number
 
-FINISHED = {0, 3}  # exit statuses of `daedalus train`: target reached or all steps done, budget used up
 _DAEDALUS = [sys.executable, "-P", "-m", "daedalus"]
 _GRACE_SECONDS = 4.4  # from SIGTERM to SIGKILL; a run needs up to 4 s to end its own processes
 _GROUP_SECONDS = 0.4  # for killed processes to disappear; both together stay below 5 s

@@ -21,7 +21,8 @@ from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.environment_check import expected_defaults, expected_spaces
 from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
-from daedalus.launch.process_lifecycle import FAILED, ORDERED, STOPPED, SUPERSEDED, UNSAVED
+from daedalus.launch.process_lifecycle import FAILED, NOT_REACHED, ORDERED, REACHED, STOPPED, SUPERSEDED, UNSAVED
+from daedalus.launch.resumed_run import status_of
 from daedalus.launch.run_choice import NewRun, check_learner_installed, warn_of_unread, with_record
 from daedalus.launch.supervision import evaluators
 from daedalus.launch.tracker_processes import TrackerProcesses
@@ -77,7 +78,6 @@ LISTEN = "tcp/127.0.0.1:7447"
 
 _PLAYER = "confirmation"  # name of the process that plays the new episodes
 
-REACHED, NOT_REACHED = 0, 3
 _FAILURES = (
     AlgorithmError,
     CheckpointMismatchError,
@@ -263,7 +263,7 @@ class LearnerProcess:
         finished = finished_run(run.directory, run.spec) if resumed else None
         if finished is not None:
             _logger.info("nothing to do: %s", finished.reason)
-            return NOT_REACHED if finished.missed else REACHED
+            return status_of(finished)
         if resumed and options.new.demonstrations is not None:
             _logger.info("the demonstrations are those that the run began with, if it has any")
         restored = _newest_checkpoint(run.directory) if resumed else None

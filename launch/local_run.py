@@ -90,7 +90,7 @@ class LocalRun:
 class RunEnd:
     """End of a run: exit status and summary."""
 
-    status: int  # 0: target reached, or all steps done without a target to stop at; 3: budget used up before the target
+    status: int  # REACHED or NOT_REACHED
     summary: dict[str, Any]  # summary.json, with the evaluation
 
 

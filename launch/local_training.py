@@ -21,7 +21,7 @@ from daedalus.launch.local_run import (
     learner_arguments,
     resume_command,
 )
-from daedalus.launch.process_lifecycle import FAILED, ORDERED, SUPERSEDED, UNSAVED
+from daedalus.launch.process_lifecycle import FAILED, FINISHED, ORDERED, SUPERSEDED, UNSAVED
 from daedalus.launch.supervision import (
     GATEWAY,
     INFERENCE,
@@ -52,8 +52,6 @@ from daedalus.transport.private_address import private_address
 from daedalus.transport.process_usage import available_processors
 
 _logger = logging.getLogger(__name__)
-
-FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
 
 _POLL_SECONDS = 0.05
 EVALUATOR = "evaluator"

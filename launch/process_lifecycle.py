@@ -25,6 +25,10 @@ _logger = logging.getLogger(__name__)
 # Exit statuses of every command; docs/operations.md has the table of all. A supervisor starts a process that failed
 # again, and not one that was started wrongly: that fails each time.
 FAILED, BAD_USAGE = 1, 2
+# Exit statuses of a run that has finished: the target was reached, or all steps were done without a target to stop at;
+# and the budget was used up before the target.
+REACHED, NOT_REACHED = 0, 3
+FINISHED = {REACHED, NOT_REACHED}
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
 STOPPED = 128 + signal.SIGTERM
 ORDERED = 4  # exit status of a supervised learner that an operator stopped

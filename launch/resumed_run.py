@@ -8,6 +8,7 @@ from typing import Any
 
 from daedalus.launch.environment_check import checked_spaces
 from daedalus.launch.local_run import LocalRun
+from daedalus.launch.process_lifecycle import NOT_REACHED, REACHED
 from daedalus.launch.run_choice import RunChoice, check_learner_installed, warn_of_unread, with_record
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.resuming import (
@@ -25,8 +26,6 @@ from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_code import Surroundings
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import RunSpec
-
-MISSED = 3  # exit status: the budget was used up before the target
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +74,7 @@ def locked_to_resume(directory: Path) -> tuple[RunLock, Path | None]:
 
 def status_of(finished: FinishedRun) -> int:
     """Return the exit status of a run that has nothing left to train."""
-    return MISSED if finished.missed else 0
+    return NOT_REACHED if finished.missed else REACHED
 
 
 def resumed_run(

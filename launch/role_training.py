@@ -16,8 +16,8 @@ from daedalus.launch.local_run import (
     actor_arguments,
     helper_log_words,
 )
-from daedalus.launch.local_training import EVALUATOR, FINISHED, stopped_by, supervised_learner
-from daedalus.launch.process_lifecycle import ORDERED, UNSAVED
+from daedalus.launch.local_training import EVALUATOR, stopped_by, supervised_learner
+from daedalus.launch.process_lifecycle import FINISHED, ORDERED, UNSAVED
 from daedalus.launch.supervision import (
     LEARNER_GRACE_SECONDS,
     Child,

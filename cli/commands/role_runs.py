@@ -23,7 +23,7 @@ from daedalus.launch.environment_check import EnvironmentProblemError
 from daedalus.launch.local_run import LocalRun, RunFailedError, RunStoppedError, UnsavedError
 from daedalus.launch.local_training import evaluate_run
 from daedalus.launch.logs import print_error, say
-from daedalus.launch.process_lifecycle import status_at_start
+from daedalus.launch.process_lifecycle import NOT_REACHED, REACHED, status_at_start
 from daedalus.launch.resumed_run import locked_to_resume, resumed_run, status_of
 from daedalus.launch.role_training import RoleRun, RoleTraining, check_roles, seats_of
 from daedalus.launch.run_choice import NewRun, create_run
@@ -84,7 +84,7 @@ def resume_roles(parsed: argparse.Namespace, directories: Mapping[str, Path], sc
             return status_at_start(error) if isinstance(error, (SettingsError, UserModuleError)) else 1
         if not roles.runs:
             say(f"nothing to do: the runs of {', '.join(roles.over)} are over")
-            return 3 if roles.missed else 0
+            return NOT_REACHED if roles.missed else REACHED
         return _run(roles, parsed, screen, "daedalus resume")
 
 
@@ -187,7 +187,7 @@ def _run(roles: _Roles, parsed: argparse.Namespace, screen: Screen, command: str
                 text = "\n".join(filter(None, [report(role.run, summary), left_report(role.run.directory)]))
                 show("\n".join(f"{role.role}: {line}" for line in text.splitlines()), command)
         trained = [run.trained for run in roles.runs.values() if run.trained is not None]
-        return max([*statuses.values(), *trained, 3 if roles.missed else 0])
+        return max([*statuses.values(), *trained, NOT_REACHED if roles.missed else REACHED])
     except RunStoppedError as error:
         show(stopped_text(error, roles.resume_command), command)
         return 1

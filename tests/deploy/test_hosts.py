@@ -11,8 +11,7 @@ import pytest
 from certificates import make_certificates
 from commands import check
 
-from daedalus.launch.learner_process import NOT_REACHED
-from daedalus.launch.process_lifecycle import BAD_USAGE, SUPERSEDED
+from daedalus.launch.process_lifecycle import BAD_USAGE, NOT_REACHED, SUPERSEDED
 
 ROOT = Path(__file__).parents[2]
 SYSTEMD = ROOT / "deploy" / "systemd"

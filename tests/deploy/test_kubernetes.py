@@ -15,8 +15,7 @@ from certificates import make_certificates
 from commands import check
 from processes import LIMIT, until
 
-from daedalus.launch.learner_process import NOT_REACHED
-from daedalus.launch.process_lifecycle import BAD_USAGE, SUPERSEDED
+from daedalus.launch.process_lifecycle import BAD_USAGE, NOT_REACHED, SUPERSEDED
 from daedalus.protocol.keys import owner
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "kubernetes"
