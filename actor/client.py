@@ -167,18 +167,12 @@ class Client:
         that is not above 0; DatasetError for a dataset that exists, or without Minari; ActorError, TransportError,
         EnvironmentSetupError, AddressError or CredentialsError.
         """
-        if isinstance(seats, str) or (bool(seats) != (turns is not None)):
-            raise ValueError("give both seats, a list of names, and turns, or neither")
-        agents = agents if agents is not None else max(len(seats), 1)
-        if not isinstance(agents, Integral) or not 1 <= agents <= MAX_ENVIRONMENTS:
-            raise ValueError(f"agents is {agents!r}: it must be from 1 to {MAX_ENVIRONMENTS}")
-        if seats and agents % len(seats):
-            raise ValueError(f"agents is {agents}: with {len(seats)} seats in each match it must be a multiple of them")
+        agents = _number_of_agents(agents, seats, turns)
         if link not in get_args(LinkChoice):
             raise ValueError(f"link is {link!r}: choose from {', '.join(get_args(LinkChoice))}")
         if not isinstance(timeout, Real) or not timeout > 0.0:
             raise ValueError(f"timeout is {timeout!r}: it must be a number of seconds above 0")
-        agents, timeout = int(agents), min(float(timeout), threading.TIMEOUT_MAX)  # threading takes no others
+        timeout = min(float(timeout), threading.TIMEOUT_MAX)  # threading takes no others
         guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
         identity = credentials.name if credentials else ""
@@ -219,15 +213,19 @@ class Client:
             self._service = ActorService(config, transport, self._stop, self._collector, report=self._report)
             self._collector.on_rollout = self._service.wake
             self._thread.start()
-            left = max(began + timeout - time.monotonic(), 0.0)
-            if not self._collector.policy_loaded.wait(left) and not self._collector.has_joined:
-                self._collector.policy_loaded.wait(_REFUSAL_SECONDS)  # the thread knows why it cannot join
-            if not self._collector.policy_loaded.is_set():
-                raise ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
-            self._check()
+            self._await_policy(began, timeout)
         except BaseException:  # also Ctrl-C: a process that ends with an open session aborts
             self.close()
             raise
+
+    def _await_policy(self, began: float, timeout: float) -> None:
+        """Wait for the first policy until `timeout` seconds after `began`. Raises ActorError without one."""
+        left = max(began + timeout - time.monotonic(), 0.0)
+        if not self._collector.policy_loaded.wait(left) and not self._collector.has_joined:
+            self._collector.policy_loaded.wait(_REFUSAL_SECONDS)  # the thread knows why it cannot join
+        if not self._collector.policy_loaded.is_set():
+            raise ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
+        self._check()
 
     def act(self, observation: Any, action_mask: Any = None, *, override: Any = None) -> Any:
         """See ClientAgent.act: this is the first agent."""
@@ -327,3 +325,14 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _number_of_agents(agents: int | None, seats: Sequence[str], turns: bool | None) -> int:
+    if isinstance(seats, str) or (bool(seats) != (turns is not None)):
+        raise ValueError("give both seats, a list of names, and turns, or neither")
+    agents = agents if agents is not None else max(len(seats), 1)
+    if not isinstance(agents, Integral) or not 1 <= agents <= MAX_ENVIRONMENTS:
+        raise ValueError(f"agents is {agents!r}: it must be from 1 to {MAX_ENVIRONMENTS}")
+    if seats and agents % len(seats):
+        raise ValueError(f"agents is {agents}: with {len(seats)} seats in each match it must be a multiple of them")
+    return int(agents)
