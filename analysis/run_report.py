@@ -74,11 +74,12 @@ def run_page(group: Group[RunRecord], by: str) -> str:
     """
     (record,) = group.runs
     settings = record.settings
+    seed, actors = settings.get("training.seed"), settings.get("collection.actors")
     facts = [
         settings.get(ENVIRONMENT),
         settings.get("training.algorithm"),
-        *(f"{name} {settings[key]}" for name, key in (("seed", "training.seed"),) if settings.get(key) is not None),
-        *(f"{settings[key]} actors" for key in ("collection.actors",) if settings.get(key) is not None),
+        None if seed is None else f"seed {seed}",
+        None if actors is None else f"{actors} actors",
     ]
     unfinished = record.unfinished
     return _document(
