@@ -11,7 +11,7 @@ from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.policy.network.action_distribution import ActionDistribution
 from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_code import first_line, place_of
-from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
+from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmError, AlgorithmRecord, is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import LossSpec
@@ -98,7 +98,7 @@ def _built_in() -> Iterator[tuple[str, type[Algorithm]]]:
 CLASSES = dict(_built_in())
 
 
-def build_algorithm(spec: LossSpec, distribution: ActionDistribution, modules: UserModules = NO_MODULES) -> Algorithm:
+def build_algorithm(spec: LossSpec, distribution: ActionDistribution, modules: UserModules) -> Algorithm:
     """Return the algorithm named by `spec.algorithm`, for a policy with these action distributions.
 
     `modules` may be imported. Raises AlgorithmError for an algorithm of the user's own that cannot be constructed.

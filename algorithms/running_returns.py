@@ -81,7 +81,7 @@ class Streams(Generic[_State]):
 class RunningReturns:
     """The return G_t = r_t + discount_factor * G_{t-1} of each row, which begins at 0 with each episode."""
 
-    def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:
+    def __init__(self, discount_factor: float, *, synchronous: bool) -> None:
         self._discount_factor = discount_factor
         self._streams = Streams[np.ndarray](synchronous=synchronous)  # of G [E]
 

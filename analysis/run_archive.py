@@ -160,7 +160,7 @@ def parts_of(directory: Path) -> tuple[list[Path], list[str]]:
     return files, others
 
 
-def write_archive(directory: Path, output: Path, *, replay: bool = True) -> tuple[RunArchive, list[str]]:
+def write_archive(directory: Path, output: Path, *, replay: bool) -> tuple[RunArchive, list[str]]:
     """Write the archive of a run that no process trains, verify it, and return it, and what a person has to know.
 
     Args:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 from daedalus.gateway.watching.learner_source import LearnerSource
-from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.messages import MetricsReport, RunStatus
 from daedalus.transport.interface import RefusedError, Transport, TransportError
@@ -58,7 +57,7 @@ _MOST_PAGES = 8  # of the metrics for one look
 class RunWatcher:
     """Watcher of the learners that answer at an address."""
 
-    def __init__(self, transport: Transport, run: str = keys.ANY_RUN) -> None:
+    def __init__(self, transport: Transport, run: str) -> None:
         """Construct the watcher. `run` is the name of the run, or `*` for all runs."""
         self._transport, self._run = transport, run
         self._source = LearnerSource(transport, run)

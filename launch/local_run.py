@@ -101,7 +101,7 @@ def resume_command(run: LocalRun) -> str:
     return shlex.join(["daedalus", "resume", str(run.directory), *allow_settings(run.spec.user_modules)])
 
 
-def learner_arguments(run: LocalRun, address: str, *, first: bool, joins: bool = False) -> list[str]:
+def learner_arguments(run: LocalRun, address: str, *, first: bool, joins: bool) -> list[str]:
     """Return the arguments of the learner, which also listens at an address for the children of this machine.
 
     Args:

@@ -85,7 +85,7 @@ class RoleTraining:
     """A learner for each role, and actors that take part in all runs, as supervised processes."""
 
     def __init__(
-        self, roles: Sequence[RoleRun], over: Sequence[RoleRun], output: ChildOutput, listen: str | None = None
+        self, roles: Sequence[RoleRun], over: Sequence[RoleRun], output: ChildOutput, listen: str | None
     ) -> None:
         """Start no process yet.
 

@@ -62,7 +62,7 @@ def ask(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None
     return found.statuses
 
 
-def survey(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None = None) -> Survey:
+def survey(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None) -> Survey:
     """Return the status of each learner that answers within 5 s, and what cannot be read. Raises TransportError.
 
     The statuses are sorted by run. If several learners of one run answer, the newest is first, and each other one has

@@ -37,7 +37,7 @@ def check_game(
     seconds: float,
     env_steps: int,
     seed: int,
-    bots: Sequence[str] = (),
+    bots: Sequence[str],
 ) -> EnvironmentReport:
     """Make one copy of a game, play it with random actions in all seats, and close it. See check_environment.
 

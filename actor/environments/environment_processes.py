@@ -68,7 +68,7 @@ class OfItsOwnProcess(gymnasium.Wrapper):
     other letters than those of its space. Texts that nobody reads are therefore empty.
     """
 
-    def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str] = ()) -> None:
+    def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str]) -> None:
         """Construct from the environment, its id, and the names of components that nobody reads."""
         super().__init__(environment)
         self._name = name

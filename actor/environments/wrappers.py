@@ -59,7 +59,7 @@ class OfItsSpace(gymnasium.Wrapper):
     makes of it depends on environment.processes.
     """
 
-    def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str] = ()) -> None:
+    def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str]) -> None:
         """Construct from the environment, its id, and the names of components that nobody reads."""
         super().__init__(environment)
         self._name = name

@@ -155,9 +155,7 @@ class Recorder(gymnasium.Wrapper):
                 observation, _, terminated, truncated, info = self.step(action)
                 over = terminated or truncated
 
-    def play_in_window(
-        self, keys: dict[str, Any] | None, idle: Any, rate: int | None, gamepad: Gamepad | None = None
-    ) -> None:
+    def play_in_window(self, keys: dict[str, Any] | None, idle: Any, rate: int | None, gamepad: Gamepad | None) -> None:
         """Let a person play in a window, until all episodes are recorded or it is closed.
 
         Args:

@@ -182,7 +182,7 @@ def watch_status(
     text: Callable[[RunStatus], str],
     *,
     frames: bool,
-    tagged: Collection[str] | None = None,
+    tagged: Collection[str] | None,
 ) -> None:
     """Show the runs until Ctrl-C.
 

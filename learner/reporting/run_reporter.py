@@ -162,7 +162,7 @@ class RunReporter:
             hint = self._episode_hint.take(self._counters, self._context.fleet)
         return hint or self._observation_hint.take() or self._learning_hint.take()
 
-    def _details(self, learner: "Learner", now: float, *, last: bool = False) -> Details:
+    def _details(self, learner: "Learner", now: float, *, last: bool) -> Details:
         """Return the distributions and the picture that belong to a metrics row; most rows have none."""
         if now < self._details_at and not last:
             return Details()

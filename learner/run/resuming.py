@@ -116,7 +116,7 @@ def _values(spec: RunSpec) -> dict[str, Any]:
     return flat_settings(spec.model_dump(mode="json"))
 
 
-def check_initial(directory: Path | None, *, other_spaces: bool = False) -> None:
+def check_initial(directory: Path | None, *, other_spaces: bool) -> None:
     """Raise SettingsError if no policy can be read from a directory, that of --init-from; None: there is none.
 
     `other_spaces` is --allow-other-spaces, which needs a directory.
