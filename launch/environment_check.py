@@ -20,7 +20,7 @@ from daedalus.launch.forked_process import fork as fork_process
 from daedalus.launch.forked_process import open_descriptors
 from daedalus.launch.process_lifecycle import interrupts_held
 from daedalus.policy.user_code import names_place
-from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.transport.process_usage import available_processors
@@ -291,8 +291,7 @@ def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "Envir
     from daedalus.actor.checking.check_report import EnvironmentReport, slow_start
 
     try:
-        modules = UserModules(frozenset(modules_of(spec.user_modules)))
-        report = quick_check(spec.environment, modules, fork=fork, for_settings=for_settings)
+        report = quick_check(spec.environment, UserModules.of(spec.user_modules), fork=fork, for_settings=for_settings)
     except CheckTimeoutError as error:
         hint = slow_start(spec)
         _logger.warning("the check of the environment was %s: the run starts without it%s", error, hint)
@@ -332,8 +331,7 @@ def transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None, *,
     if spec.environment == before.environment or spaces is None:
         return spaces
     try:
-        modules = UserModules(frozenset(modules_of(spec.user_modules)))
-        report = quick_check(spec.environment, modules, play=False, fork=fork)
+        report = quick_check(spec.environment, UserModules.of(spec.user_modules), play=False, fork=fork)
     except CheckTimeoutError:
         return None
     if problem := (*report.problems, report.text_problem(spec))[0]:

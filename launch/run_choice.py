@@ -29,7 +29,7 @@ from daedalus.learner.run.settings import (
     unread_settings,
 )
 from daedalus.policy.user_code import Surroundings
-from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -244,7 +244,7 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
         raise SettingsError(problem)
     # A file may be the config.toml of another run, with the default settings of its environment.
     warn_of_unread(choice.names(), spec, unread_settings(spec, spaces) & choice.assigned)
-    return with_record(spec, UserModules(frozenset(modules_of(spec.user_modules)))), spaces
+    return with_record(spec, UserModules.of(spec.user_modules)), spaces
 
 
 def warn_of_unread(chosen: set[str], spec: RunSpec, too: AbstractSet[str] = frozenset()) -> None:

@@ -57,6 +57,11 @@ class UserModules:
     allowed: frozenset[str] = frozenset()
     source: str = "a setting"  # whose settings name modules, such as "the learner" or a path; for messages
 
+    @classmethod
+    def of(cls, settings: Mapping[str, str]) -> "UserModules":
+        """Return the modules of settings that the user of this process has chosen."""
+        return cls(frozenset(modules_of(settings)))
+
     def check(self, settings: Mapping[str, str]) -> None:
         """Check that all modules that settings name are allowed.
 

@@ -20,7 +20,7 @@ from daedalus.launch.logs import print_error, say
 from daedalus.launch.run_choice import RunChoice, check_learner_installed
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.league import is_bot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -79,7 +79,7 @@ def check(arguments: list[str]) -> int:
 
 def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str, str]]:
     """Return the lines of the report, each with its name."""
-    environment, modules = spec.environment, UserModules(frozenset(modules_of(spec.user_modules)))
+    environment, modules = spec.environment, UserModules.of(spec.user_modules)
     check = EnvironmentCheck(
         spec=environment,
         modules=modules,

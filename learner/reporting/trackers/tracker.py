@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from daedalus.learner.reporting.metrics_rows import Details, MetricsWriter, tag
 from daedalus.learner.run.run_directory import run_name
-from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.policy.user_modules import UserModules
 
 PROJECT = "daedalus"  # project or experiment of the runs, unless the tracker's environment variable names another
 SUMMARY = "summary/"  # prefix of the results of a run
@@ -69,7 +69,7 @@ def tracker_class(name: str) -> OpenTracker:
     Raises KeyError for an unknown name, UserModuleError if the user's class cannot be imported.
     """
     if ":" in name:
-        modules = UserModules(frozenset(modules_of({_OPTION: name})))
+        modules = UserModules.of({_OPTION: name})
         kind = modules.attribute(_OPTION, name)
         return lambda run: OwnWriter(name, kind(run))
     return getattr(importlib.import_module("daedalus.learner.reporting.trackers.known_trackers"), _CLASSES[name])
