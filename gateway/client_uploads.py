@@ -132,7 +132,7 @@ class Outbox:
     """The clients that have a rollout to send.
 
     Encoding takes longer than the choice of an action, and clients that began together fill their rollouts together. So
-    each turn of the event loop encodes one rollout for the sender (sender.py), and answers clients between them.
+    each turn of the event loop encodes one rollout for the Sender, and answers clients between them.
     """
 
     def __init__(self) -> None:

@@ -36,7 +36,7 @@ def _reads_numbers(policy: PolicySpec, space: ArraySpace, *, alone: bool) -> boo
 def coded_components(policy: PolicySpec, spaces: ObservationSpaces) -> dict[str, tuple[int, ...]]:
     """Return how many codes each place of the last axis has, of the components in `policy.codes`.
 
-    A user's encoder receives the bytes themselves. Components that `check_codes` refuses are left out.
+    A user's encoder receives the bytes themselves. Components that `codes_problem` names are left out.
     """
     if ":" in policy.encoder:
         return {}

@@ -4,7 +4,7 @@ Only the files named `zenoh_*.py` import Zenoh. What Zenoh needs of its user (me
   - Congestion control BLOCK is not flow control: Zenoh disconnects a peer that stalls, and drops all that the peer
     had queued. So rollouts are queries that are answered, and snapshots are put with DROP.
   - A process that ends with a callback declared and its session open hangs for ever: call `close` in a `finally`.
-  - Closing a dead connection blocks one of two receiving threads for 10 s: `Linger` below prevents this.
+  - Closing a dead connection blocks one of two receiving threads for 10 s: `LingerRemoval` prevents this.
 """
 
 import contextlib

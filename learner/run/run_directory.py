@@ -6,7 +6,7 @@ summary.json     result of the run                     events.*      the same me
 learner.lock     locked by the learner that runs
 config.toml.before  the settings before those of a resumed run, until its learner begins with them
 heartbeat        its age shows that the learner works (heartbeat.py)
-events.jsonl     what happened: actors that joined and left, rejections, restarts (event_file.py)
+events.jsonl     what happened: actors that joined and left, rejections, restarts (serving/events.py)
 evaluation.json  result of the final evaluation, with the return of each episode
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 report.html      a page about the run, which `daedalus train` leaves at its end
