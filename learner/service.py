@@ -47,7 +47,6 @@ class Outcome:
     solved: bool
     finished: bool  # solved or out of budget; False if the run was stopped before
     saved: bool  # whether the last checkpoint was saved, or there was nothing to save
-    seconds_to_target: float | None  # seconds until the target return was reached; None if it was not
     stopped_by: str = ""  # the operator who stopped the run; empty if none did
     superseded_by: int | None = None  # epoch of a newer learner of this run, for which this one stepped down
 
@@ -174,14 +173,7 @@ class LearnerService:
         if self._server.orders.stopped_by:  # else nothing has happened that anybody looks for
             EventFile(self._context.directory).add(self._context.events.take_new())
         self._server.orders.take_checkpoint()(True, f"stopped {when}: there is nothing to save")
-        return Outcome(
-            solved=False,
-            finished=False,
-            saved=True,
-            seconds_to_target=None,
-            stopped_by=self._server.orders.stopped_by,
-            superseded_by=self._server.orders.superseded_by,
-        )
+        return self._outcome(finished=False, saved=True)
 
     def _training_of(self, learner: "Learner") -> "tuple[Checkpointer, TrainingLoop]":
         """Publish the policy. Return its checkpointer and its training loop."""
@@ -253,11 +245,13 @@ class LearnerService:
             server.await_departures()
         elif saved:
             _logger.info("stopped; checkpoint saved at %s: %s", env_steps, shown_path(str(saving.directory)))
+        return self._outcome(finished=finished, saved=saved)
+
+    def _outcome(self, *, finished: bool, saved: bool) -> Outcome:
         return Outcome(
-            solved=context.counters.seconds_to_target is not None,
+            solved=self._context.counters.seconds_to_target is not None,
             finished=finished,
             saved=saved,
-            seconds_to_target=context.counters.seconds_to_target,
             stopped_by=self._server.orders.stopped_by,
             superseded_by=self._server.orders.superseded_by,
         )
