@@ -20,6 +20,10 @@ ZENOH_ANSWER = """
     router.serve("d/r/join", lambda request: request.reply(b""))
     router.query_async("d/r/join", b"", timeout=30.0, on_answer=fail)
 """
+ZENOH_PRESENCE = """
+    router.watch_presence("d/r/learner", fail)
+    router.declare_presence("d/r/learner")
+"""
 PROGRAM = """
     import socket, threading, time
     from daedalus.launch.logs import configure_logging
@@ -36,7 +40,11 @@ PROGRAM = """
 """
 
 
-@pytest.mark.parametrize("cause", [THREAD, ZENOH_HANDLER, ZENOH_ANSWER], ids=["thread", "handler", "answer"])
+@pytest.mark.parametrize(
+    "cause",
+    [THREAD, ZENOH_HANDLER, ZENOH_ANSWER, ZENOH_PRESENCE],
+    ids=["thread", "handler", "answer", "presence"],
+)
 def test_exception_in_a_thread_ends_the_process_with_a_traceback(cause: str) -> None:
     program = textwrap.dedent(PROGRAM) + textwrap.dedent(cause) + "time.sleep(1000)\n"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=SECONDS)

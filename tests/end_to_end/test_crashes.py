@@ -1,6 +1,7 @@
 """An exception in any thread of a service ends its process: traceback, status 1, so that a supervisor restarts it.
 
-That of an actor is tested in test_refusals.py, where there is a learner for it.
+The kinds of threads are in tests/cli/test_thread_exceptions.py. An actor is in test_refusals.py, where there is a
+learner for it.
 """
 
 import subprocess
@@ -8,27 +9,16 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 from faults import Faulty
 from processes import LIMIT, Running
 
 Start = Callable[..., Running]
 
-# A module, and an assignment in it that makes the named thread raise the next time it works.
-LEARNER_FAULTS = {
-    "intake": "daedalus.learner.serving.rollout_judge:RolloutJudge.read",
-    "a Zenoh thread that reports presence": "daedalus.learner.serving.fleet:Fleet.set_present",
-}
 
-
-@pytest.mark.parametrize("thread", LEARNER_FAULTS)
-def test_an_exception_in_a_thread_of_the_learner_ends_it(
-    thread: str, start: Start, address: str, tmp_path: Path
-) -> None:
+def test_an_exception_in_a_thread_of_the_learner_ends_it(start: Start, address: str, tmp_path: Path) -> None:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**12)
-    learner = Faulty(
-        tmp_path, "learner", LEARNER_FAULTS[thread], "cartpole", "--listen", address, "--run-dir", "run", *endless
-    )
+    intake = "daedalus.learner.serving.rollout_judge:RolloutJudge.read"
+    learner = Faulty(tmp_path, "learner", intake, "cartpole", "--listen", address, "--run-dir", "run", *endless)
     actor = start("actor", "--connect", address)
     learner.assert_crashes()
     assert actor.process.poll() is None  # it looks for the learner that a supervisor would restart
