@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TextIO
@@ -24,6 +23,7 @@ from daedalus.analysis.sweep_plan import PlannedRun, has_begun, is_done
 from daedalus.analysis.sweep_search import Search
 from daedalus.launch.process_lifecycle import FINISHED
 from daedalus.launch.supervision import stop
+from daedalus.learner.reporting.progress import RewrittenLine
 from daedalus.learner.run.run_directory import METRICS, SUMMARY, read_json, remove_failed
 from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.settings import SettingsError
@@ -142,17 +142,17 @@ _LINE_SECONDS = 60.0  # and elsewhere
 _TAIL_BYTES = 1 << 13
 
 
-class Display:
+class Display(RewrittenLine):
     """Lines about a sweep."""
 
     def __init__(self, stream: TextIO, total: int) -> None:
         """`total` is the number of runs."""
-        self._stream, self._total = stream, total
+        super().__init__(stream)
+        self._total = total
         self._terminal = stream.isatty()
         self._began = time.monotonic()
         self._next = self._began + (0.0 if self._terminal else _LINE_SECONDS)
         self._first_share: float | None = None
-        self._rewriting = False
 
     @property
     def terminal(self) -> bool:
@@ -180,8 +180,7 @@ class Display:
             mean = row.get("episode_return_mean")
             parts.append(f"{run.name} {100 * share:.0f} %" + ("" if mean is None else f" return {short_number(mean)}"))
         if self._terminal:
-            self._write(f"\r\x1b[K{'  '.join(parts)[: max(shutil.get_terminal_size().columns - 1, 0)]}")
-            self._rewriting = True
+            self.rewrite("  ".join(parts)[: max(shutil.get_terminal_size().columns - 1, 0)])
         else:
             self._write("  ".join(parts) + "\n")
 
@@ -195,17 +194,6 @@ class Display:
             return "left -"
         seconds = (now - self._began) * (1.0 - share) / done
         return f"left {seconds:.0f} s" if seconds < 100.0 else f"left {seconds / 60:.0f} min"
-
-    def end(self) -> None:
-        """End the line that is being rewritten."""
-        if self._rewriting:
-            self._write("\n")
-            self._rewriting = False
-
-    def _write(self, text: str) -> None:
-        with suppress(OSError):  # nobody reads it any more: the sweep goes on
-            self._stream.write(text)
-            self._stream.flush()
 
 
 def newest_row(run: PlannedRun) -> dict[str, float]:

@@ -19,16 +19,38 @@ _SHOWN_OPPONENTS = 2  # in the line
 _logger = logging.getLogger(__name__)
 
 
-class Progress:
+class RewrittenLine:
+    """Line of a terminal that each text replaces. Whoever reads it may go away: the work that it shows goes on."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._rewriting = stream, False
+
+    def rewrite(self, text: str) -> None:
+        """Show a text in place of the one before."""
+        self._write(f"\r\x1b[K{text}")
+        self._rewriting = True
+
+    def end(self) -> None:
+        """End the line that is being rewritten."""
+        if self._rewriting:
+            self._write("\n")
+            self._rewriting = False
+
+    def _write(self, text: str) -> None:
+        with suppress(OSError):
+            self._stream.write(text)
+            self._stream.flush()
+
+
+class Progress(RewrittenLine):
     """Display of the newest metrics row."""
 
     def __init__(self, stream: TextIO, env_steps_budget: int, updates_per_batch: int = 1) -> None:
-        self._stream = stream
+        super().__init__(stream)
         self._budget = env_steps_budget
         self.updates_per_batch = updates_per_batch  # by which a policy lag in updates is one in batches
         self._terminal = is_terminal(stream)
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
-        self._rewriting = False
 
     def show(self, row: Mapping[str, float], waits_for: str = "") -> None:
         """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds.
@@ -42,9 +64,8 @@ class Progress:
         parts = _parts(row, self._budget, self.updates_per_batch)
         parts = [parts[0], waits_for, parts[-1]] if waits_for else parts
         if self._terminal:
-            line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
-            self._write(f"\r\x1b[K{line}")
-            self._rewriting = True
+            # The last column would begin a new line.
+            self.rewrite(_fitted(parts, shutil.get_terminal_size().columns - 1))
         else:
             _logger.info("%s", "  ".join(parts))
 
@@ -52,17 +73,6 @@ class Progress:
         """Print a permanent line."""
         self.end()
         self._write(text + "\n")
-
-    def end(self) -> None:
-        """End the line that is being rewritten."""
-        if self._rewriting:
-            self._write("\n")
-            self._rewriting = False
-
-    def _write(self, text: str) -> None:
-        with suppress(OSError):  # nobody reads it any more: training goes on
-            self._stream.write(text)
-            self._stream.flush()
 
 
 class SilentProgress(Progress):
