@@ -24,6 +24,7 @@ from daedalus.actor.evaluation.episodes import (
 from daedalus.actor.evaluation.video import Video
 from daedalus.launch.environment_object import environment_object
 from daedalus.launch.evaluation_options import (
+    FINAL_SEEDS,
     EvaluationOptions,
     actions_of,
     check_spaces,
@@ -198,7 +199,7 @@ def _evaluated(
 
 
 def _seed(policy: SavedPolicy, options: EvaluationOptions) -> int:
-    return policy.spec.training.seed + 2**32 if options.seed is None else options.seed
+    return policy.spec.training.seed + FINAL_SEEDS if options.seed is None else options.seed
 
 
 def _play(

@@ -22,6 +22,7 @@ EPISODES = 100  # without a video or a window
 GAMES = 200  # against an opponent
 _MOST_EPISODES = 1_000_000  # their results are held in memory
 _MOST_OPENINGS = 1000
+FINAL_SEEDS = 2**32  # added to the seed of the run for its final episodes: training uses none of these seeds
 _WIDTHS = range(16, 4097)
 
 

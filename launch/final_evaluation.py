@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episodes import EvaluationStoppedError
-from daedalus.launch.evaluation_options import EvaluationOptions, evaluated_environment
+from daedalus.launch.evaluation_options import FINAL_SEEDS, EvaluationOptions, evaluated_environment
 from daedalus.launch.logs import configure_logging, print_error
 from daedalus.launch.match_evaluation import MatchScores, evaluated_matches
 from daedalus.launch.process_lifecycle import (
@@ -44,8 +44,7 @@ from daedalus.transport.interface import Transport, TransportError
 
 _logger = logging.getLogger("daedalus.launch.final_evaluation")  # this module is __main__ in the process
 
-# Added to the seed of the run, so that neither training nor another evaluation uses these seeds.
-_FINAL_SEEDS, _SELECTION_SEEDS = 2**32, 2**33
+_SELECTION_SEEDS = 2**33  # see FINAL_SEEDS
 _FAILURES = (
     *(EnvironmentSetupError, EvaluatorError, NoPolicyError, DamagedError, HubError),
     *(ModuleNotAllowedError, PolicyError, SettingsError, TransportError),
@@ -193,7 +192,7 @@ class FinalEpisodes:
             copy = opponent_copy(name, directory / run_directory.LEAGUE)  # the policy that training has met
             against = str(copy) if copy.exists() else name
             options = EvaluationOptions(directory=directory, against=against, episodes=games, allowed_modules=modules)
-            seed = spec.training.seed + _FINAL_SEEDS
+            seed = spec.training.seed + FINAL_SEEDS
             result = evaluated_matches(policy, options, seed, self._stop, io.StringIO())
             results.append({**result, "matches": replace(result["matches"], opponent=name)})
         evaluation = {**results[0], "matches": asdict(results[0]["matches"])}
@@ -217,14 +216,14 @@ class FinalEpisodes:
         summary = run_directory.read_json(directory / run_directory.SUMMARY)
         chosen = self.select_best()
         best, backend = [find_policy(directory)], spec.evaluation.final_backend or spec.environment.backend
-        ((evaluation, report),) = self.play(best, backend, _FINAL_SEEDS, spec.evaluation.actions)
+        ((evaluation, report),) = self.play(best, backend, FINAL_SEEDS, spec.evaluation.actions)
         confirmed = summary.get("confirmation") is not None  # by sampled episodes
         can_differ = spec.algorithm.heads != "action_values"  # whose policy is always greedy
         true_task, trained = spec.trains_true_task, summary.get("episode_return_mean")
         if not true_task and trained is not None:
             evaluation["notes"].append(other_task_note(trained))
         if true_task and not confirmed and can_differ and is_below_training(evaluation, trained):
-            ((sampled, _),) = self.play(best, backend, _FINAL_SEEDS, "sampled")
+            ((sampled, _),) = self.play(best, backend, FINAL_SEEDS, "sampled")
             evaluation["notes"].append(sampled_note(evaluation, sampled))
             summary["sampled_evaluation"] = sampled
         summary |= evaluation_summary(evaluation, select_best=chosen, seconds=time.monotonic() - began)
