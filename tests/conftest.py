@@ -1,4 +1,4 @@
-"""Fixtures for tests with processes."""
+"""Fixtures that several test files share."""
 
 import gc
 import json
@@ -6,12 +6,16 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import log_lines
 import pytest
 from _pytest.assertion import rewrite
 from hypothesis import Phase, settings
 from processes import Running, free_address, starting
+
+if TYPE_CHECKING:
+    from daedalus.transport.memory import MemoryNetwork
 
 # The tensors of the tests are small. Further threads would spend most of their time waiting, on the cores of the other
 # processes of the tests. A learner sets its own number of threads.
@@ -99,3 +103,18 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
 def address() -> str:
     """Return a loopback address that no process listens on."""
     return free_address()
+
+
+@pytest.fixture
+def network() -> "MemoryNetwork":
+    """Return the network that the test's transports share."""
+    from daedalus.transport.memory import MemoryNetwork  # with numpy, for which the environment is set above
+
+    return MemoryNetwork()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of the test, which is the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

@@ -9,12 +9,6 @@ from daedalus.transport.memory import MemoryNetwork
 
 
 @pytest.fixture
-def network() -> MemoryNetwork:
-    """The network that the test's transports share."""
-    return MemoryNetwork()
-
-
-@pytest.fixture
 def actor(network: MemoryNetwork) -> Iterator[RunningActor]:
     """An actor that runs until the end of the test."""
     running = RunningActor(network)

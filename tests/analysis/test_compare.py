@@ -14,12 +14,6 @@ from daedalus.cli.commands.compare import compare
 FAST, SLOW = ("collection.rollout_length=5",), ("collection.rollout_length=64",)
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def five(folder: Path, name: str, settings: tuple[str, ...], evaluation: float, env_steps: int) -> None:
     """Record five seeds that reach the target after `env_steps` or up to 4 env_steps later."""
     for seed in range(5):

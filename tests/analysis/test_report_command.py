@@ -51,12 +51,6 @@ def drawn_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def evaluated(directory: Path, returns: Sequence[float] = RETURNS, **changes: Any) -> Path:
     """Write evaluation.json as `daedalus evaluate --json` prints it."""
     mean = sum(returns) / len(returns)

@@ -27,12 +27,6 @@ from daedalus.policy.saving.sealed import write_sealed
 from daedalus.protocol.spec import RunSpec
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def contents(directory: Path) -> dict[str, tuple[bytes, int]]:
     files = [path for path in directory.rglob("*") if path.is_file() and path.name != "learner.lock"]
     return {path.relative_to(directory).as_posix(): (path.read_bytes(), int(path.stat().st_mtime)) for path in files}

@@ -13,12 +13,6 @@ from daedalus.cli.commands.runs import runs
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def said(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> str:
     """Run `daedalus runs` and return what it printed to standard output, or its error."""
     assert runs([*words]) == status

@@ -31,11 +31,6 @@ def up(collector: StatusCollector) -> float | None:
 
 
 @pytest.fixture
-def network() -> MemoryNetwork:
-    return MemoryNetwork()
-
-
-@pytest.fixture
 def collector(network: MemoryNetwork) -> StatusCollector:
     collector = StatusCollector()
     collector.transport = MemoryTransport(network)

@@ -51,11 +51,6 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(orders, "_POLL_SECONDS", 0.001)
 
 
-@pytest.fixture
-def network() -> MemoryNetwork:
-    return MemoryNetwork()
-
-
 def drain(network: MemoryNetwork, *names: str, timeout: float | None = None, run: str = "*") -> None:
     orders.drain_actors(MemoryTransport(network), ALICE, run, list(names) or ["box"], timeout)
 

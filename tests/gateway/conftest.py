@@ -21,12 +21,6 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def network() -> MemoryNetwork:
-    """The network that the test's transports share."""
-    return MemoryNetwork()
-
-
-@pytest.fixture
 def learner(network: MemoryNetwork) -> Iterator[ScriptedLearner]:
     """A learner of CartPole with a policy."""
     learner = ScriptedLearner(network)

@@ -59,11 +59,6 @@ def open_server(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) ->
 
 
 @pytest.fixture
-def network() -> MemoryNetwork:
-    return MemoryNetwork()
-
-
-@pytest.fixture
 def server(network: MemoryNetwork) -> Iterator[ActorServer]:
     opened = open_server(network, run_spec(), RunCounters(10))
     yield opened

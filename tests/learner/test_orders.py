@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
 from processes import LIMIT, until
 from session_fleet import GatedActor, LearnerProcess, order_to
 
@@ -58,11 +57,6 @@ class Operator:
 def steps(report: MetricsReport) -> list[float]:
     columns = report.page.columns
     return report.values[:, columns.index("env_steps")].tolist() if columns else []
-
-
-@pytest.fixture
-def network() -> MemoryNetwork:
-    return MemoryNetwork()
 
 
 def test_operator_orders_a_checkpoint_then_the_end(network: MemoryNetwork, tmp_path: Path) -> None:

@@ -30,11 +30,6 @@ from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 ACTORS = 15
 
 
-@pytest.fixture
-def network() -> MemoryNetwork:
-    return MemoryNetwork()
-
-
 def fleet_inside_rollouts(network: MemoryNetwork) -> list[GatedActor]:
     """Return actors that have all begun a rollout, and whose gates are closed."""
     actors = [GatedActor(network, f"actor-{index}") for index in range(ACTORS)]
