@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,7 @@ from daedalus.launch.forked_process import open_descriptors
 from daedalus.launch.process_lifecycle import interrupts_held
 from daedalus.policy.user_code import names_place
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.lessons import Parameters, extremes
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.transport.process_usage import available_processors
@@ -50,6 +51,7 @@ class EnvironmentCheck:
     shown: bool = False  # show what the environment prints, on standard error, and the end of one that crashes
     notes: bool = False  # add what gymnasium's own checker says
     bots: tuple[str, ...] = ()  # fixed opponents of a game that are code
+    lessons: Sequence[Parameters] = ()  # parameters that episodes of lessons may have
 
     def run(self) -> "EnvironmentReport":
         """Check the environment in this process."""
@@ -57,7 +59,13 @@ class EnvironmentCheck:
         from daedalus.actor.checking.play import check_environment
 
         report = check_environment(
-            self.spec, self.modules, seconds=self.seconds, env_steps=self.env_steps, seed=self.seed, bots=self.bots
+            self.spec,
+            self.modules,
+            seconds=self.seconds,
+            env_steps=self.env_steps,
+            seed=self.seed,
+            bots=self.bots,
+            lessons=self.lessons,
         )
         if not self.notes or report.problems:
             return report
@@ -67,7 +75,7 @@ class EnvironmentCheck:
         """Return the check as text, for `from_words` in another process."""
         plain = {
             name: getattr(self, name)
-            for name in ("seconds", "env_steps", "seed", "most_seconds", "shown", "notes", "bots")
+            for name in ("seconds", "env_steps", "seed", "most_seconds", "shown", "notes", "bots", "lessons")
         }
         return json.dumps({**plain, "spec": self.spec.model_dump(mode="json"), "modules": sorted(self.modules.allowed)})
 
@@ -291,7 +299,8 @@ def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "Envir
     from daedalus.actor.checking.check_report import EnvironmentReport, slow_start
 
     try:
-        report = quick_check(spec.environment, UserModules.of(spec.user_modules), fork=fork, for_settings=for_settings)
+        modules, lessons = UserModules.of(spec.user_modules), extremes(spec.lessons, spec.environment.parameters)
+        report = quick_check(spec.environment, modules, fork=fork, for_settings=for_settings, lessons=lessons)
     except CheckTimeoutError as error:
         hint = slow_start(spec)
         _logger.warning("the check of the environment was %s: the run starts without it%s", error, hint)
@@ -430,6 +439,7 @@ def quick_check(
     fork: bool = False,
     stop: threading.Event | None = None,
     for_settings: bool = False,
+    lessons: Sequence[Parameters] = (),
 ) -> "EnvironmentReport":
     """Make one environment, play it for up to 0.3 s, close it, and return what was found.
 
@@ -441,6 +451,7 @@ def quick_check(
         has nothing that does not work after a fork.
       stop: ends the check early when it is set.
       for_settings: wait longer for a simulator that starts slowly: the settings of the run depend on its spaces.
+      lessons: see check_environment.
 
     Raises CheckTimeoutError.
     """
@@ -453,6 +464,7 @@ def quick_check(
             seconds=_PLAY_SECONDS if play else 0.0,
             env_steps=_PLAY_ENV_STEPS,
             most_seconds=most_seconds,
+            lessons=lessons,
         ),
         fork=fork,
         stop=stop,

@@ -39,11 +39,13 @@ from daedalus.actor.environments.gymnasium_backend import make_single, registrat
 from daedalus.actor.environments.gymnasium_environments import limited_close
 from daedalus.actor.environments.info import MASK_KEY, has_choices, mask_of_one, only_of_masks, unreported
 from daedalus.actor.environments.make import make_bare
+from daedalus.actor.environments.parameters import wrapper_of
 from daedalus.actor.environments.precision import Precision
 from daedalus.actor.environments.transforms import TransformedEnvironment, Transforms
 from daedalus.actor.environments.vector_environments import BackendEnvironments, Observed
 from daedalus.policy.user_code import first_line, place_of, print_traceback
 from daedalus.policy.user_modules import USER_STATE, UserModuleError, UserModules
+from daedalus.protocol.lessons import Parameters
 from daedalus.protocol.spaces import Spaces, StillObservations, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -205,6 +207,7 @@ def check_environment(
     env_steps: int,
     seed: int = 0,
     bots: Sequence[str] = (),
+    lessons: Sequence[Parameters] = (),
 ) -> EnvironmentReport:
     """Make one environment, play it with random actions, and close it; then the same with its vector entry point.
 
@@ -218,12 +221,13 @@ def check_environment(
       env_steps: the most steps.
       seed: of the environment and the actions.
       bots: opponents in a game that are code; each plays a match.
+      lessons: parameters of episodes, as `extremes` returns them; an episode begins with each, for about `seconds`.
     """
     if spec.is_game:
         return check_game(spec, modules, seconds=seconds, env_steps=env_steps, seed=seed, bots=bots)
     _import_first(spec, modules)
     began = time.monotonic()
-    report = _check_one(spec, modules, seconds, env_steps, seed)
+    report = _check_one(spec, modules, seconds, env_steps, seed, lessons)
     is_slow = time.monotonic() - began > 2.0 * seconds + _SLOW_START  # to make a second one could take as long
     if report.problems or report.spaces is None or seconds == 0.0:
         return report
@@ -263,7 +267,12 @@ def _evaluated_problem(spec: EnvironmentSpec, modules: UserModules, trained: Env
 
 
 def _check_one(
-    spec: EnvironmentSpec, modules: UserModules, seconds: float, env_steps: int, seed: int
+    spec: EnvironmentSpec,
+    modules: UserModules,
+    seconds: float,
+    env_steps: int,
+    seed: int,
+    lessons: Sequence[Parameters] = (),
 ) -> EnvironmentReport:
     try:
         environment, rest = make_one(spec, modules)
@@ -282,6 +291,8 @@ def _check_one(
         if seconds > 0.0:
             play.run(seconds, env_steps, seed)
         report = play.report()
+        if not report.problems:
+            _begin_with(environment, lessons, seed, time.monotonic() + seconds)
         for name, maxima in report.byte_maxima.items():
             if name in codes and not all(map(operator.lt, maxima, codes[name])):
                 del codes[name]  # a wrapper has written other numbers into some of them
@@ -291,6 +302,15 @@ def _check_one(
     finally:
         with suppress(Exception, SystemExit), limited_close():  # of the user's code
             environment.close()
+
+
+def _begin_with(environment: gymnasium.Env, lessons: Sequence[Parameters], seed: int, until: float) -> None:
+    """Begin an episode with each of some parameters. Raises EnvironmentSetupError for those that are refused."""
+    for parameters in lessons[1:]:  # the first are those of the true task
+        if time.monotonic() > until:  # actors try the others
+            return
+        wrapper_of(environment).next_parameters = parameters
+        environment.reset(seed=seed)
 
 
 def _first_mask(environment: gymnasium.Env, seed: int) -> Any:

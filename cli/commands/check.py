@@ -22,6 +22,7 @@ from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.league import is_bot
+from daedalus.protocol.lessons import extremes
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import short_number
@@ -90,6 +91,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
         shown=True,
         notes=True,
         bots=tuple(filter(is_bot, spec.league.opponents)) if environment.is_game else (),
+        lessons=extremes(spec.lessons, environment.parameters),
     )
     chosen = report = _report(check)
     processes = ""

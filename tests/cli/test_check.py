@@ -10,6 +10,7 @@ from daedalus.cli.commands.check import check
 
 ENV = ["--env", "faulty_environments:Faulty-v0", "--seconds", "0.05"]
 LONGER = ["--seconds", "1"]  # enough for several steps on a busy machine
+PARAMETER = ["--set", "environment.parameters.stones=7"]
 
 
 @pytest.fixture(autouse=True)
@@ -37,6 +38,11 @@ def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFi
             "problem       environment .* the reward nan: it must be fini",
         ),
         (["--set", "policy.encoder=nature"], "problem       the encoder 'nature' takes images"),
+        (
+            ["--env", "lesson_environment:PathWithMethod", *LONGER, *PARAMETER, "--set", "lessons.stones.steps=[1,200]"]
+            + ["--set", "lessons.stones.above=1"],
+            r"problem       .*: set_parameters\(stones=200\) raises .* change lessons.stones",
+        ),
         (
             [*("--algorithm", "own_losses:Weighted", "--set", "training.algorithm_kwargs.wieght=1")],
             "problem       training.algorithm=own_losses:Weighted: .* unexpected keyword argument 'wieght'",

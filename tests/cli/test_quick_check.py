@@ -29,6 +29,7 @@ from daedalus.launch.environment_check import (
 from daedalus.launch.run_choice import RunChoice
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.lessons import LessonSpec
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 TESTS = Path(__file__).parent.parent
@@ -53,6 +54,13 @@ def test_warnings_are_logged_and_the_spaces_are_returned() -> None:
     assert spaces is not None
     assert array_space(spaces).shape == (2,)
     assert "the value 731.5 at index 1, but observation_space goes from -1 to 1" in "\n".join(LINES)
+
+
+def test_a_value_of_a_lesson_that_the_environment_refuses_is_a_problem() -> None:
+    path = EnvironmentSpec(id="lesson_environment:PathWithMethod", parameters={"stones": 7})
+    lessons = {"stones": LessonSpec(between=(1, 200))}
+    with pytest.raises(EnvironmentProblemError, match=r"set_parameters\(stones=200\) raises .* change lessons.stones"):
+        checked_spaces(run(path).model_copy(update={"lessons": lessons}), fork=True)
 
 
 def test_an_environment_that_ends_its_process_is_a_problem() -> None:
