@@ -54,7 +54,7 @@ class Episode(NamedTuple):
 
 def dataset_folder(name: str) -> Path:
     """Return the folder of a dataset, which need not exist: `name` is a path, or an id of Minari's local datasets."""
-    if name.startswith((".", "/", "~")) or Path(name).is_dir():
+    if _is_path(name):
         return Path(name).expanduser().absolute()  # Minari joins the parts of others twice
     _import_minari()
     from minari.storage.datasets_root_dir import get_dataset_path
@@ -62,9 +62,25 @@ def dataset_folder(name: str) -> Path:
     return Path(get_dataset_path(name))
 
 
+def _is_path(name: str) -> bool:
+    return name.startswith((".", "/", "~")) or Path(name).is_dir()
+
+
 def new_dataset_folder(name: str) -> Path:
-    """Return the folder of a dataset that is to be written. Raises DatasetError if it exists, or Minari is missing."""
+    """Return the folder of a dataset that is to be written.
+
+    Raises DatasetError if it exists, if it is no id that Minari can list beside the others, or if Minari is missing.
+    """
     _import_minari()
+    if not _is_path(name):
+        from minari.dataset.minari_dataset import parse_dataset_id
+
+        try:
+            parse_dataset_id(name)
+        except (ValueError, TypeError):  # TypeError: without a version
+            raise DatasetError(
+                f"dataset {name} has no id of Minari: write NAME-v0 or NAMESPACE/NAME-v0, or ./NAME for a folder here"
+            ) from None
     folder = dataset_folder(name)
     if (folder / "data").exists():
         raise DatasetError(f"dataset {name} exists at {folder}: choose another name, or remove it")

@@ -17,6 +17,7 @@ from daedalus.policy.acting.program_check import PolicyError
 from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.protocol.league import is_bot
 from daedalus.protocol.spec import EnvironmentSpec
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def record(arguments: list[str]) -> int:
     if (parsed.directory is None) == (parsed.env is None) or (parsed.env is None) != (parsed.by is None):
         print_error("record", "name either a run directory, or --env ID and --by PLAYER")
         return 2
-    if fault := _without_effect(parsed):
+    if fault := _unfit_option(parsed):
         print_error("record", fault)
         return 2
     from daedalus.actor.environments.minari_files import DatasetError
@@ -130,8 +131,8 @@ def record(arguments: list[str]) -> int:
         return print_policy_error("record", error, arguments)
 
 
-def _without_effect(parsed: argparse.Namespace) -> str:
-    """Return what is wrong with an option that would have no effect, or an empty string."""
+def _unfit_option(parsed: argparse.Namespace) -> str:
+    """Return why an option would have no effect or names no player, or an empty string."""
     given = {
         "a RUN_DIR": {"--sampled": parsed.sampled, "--newest": parsed.newest},
         "--by keys or gamepad": {"--key": parsed.key, "--idle": parsed.idle, "--rate": parsed.rate},
@@ -143,6 +144,8 @@ def _without_effect(parsed: argparse.Namespace) -> str:
         for option, value in options.items():
             if value and not played[player]:
                 return f"{option} is for {player}: leave it out"
+    if not (parsed.by is None or parsed.by in (_KEYS, _GAMEPAD) or is_bot(parsed.by)):
+        return f"--by {parsed.by} is no player: write module:Bot, random, {_KEYS} or {_GAMEPAD}"
     return "" if parsed.episodes else "--episodes 0 must be at least 1"
 
 

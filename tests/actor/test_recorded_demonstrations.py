@@ -143,6 +143,8 @@ def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) 
         (("--env", "CartPole-v1", "--by", "gamepad", "--axis", "leftx"), 2, "write AXIS=N"),
         (("--env", "pumping:Unseen", "--by", "keys", "--key", "a=1"), 1, "render() must return an array"),
         (("--env", "CartPole-v1", "--by", "pumping:Nobody"), 1, "Nobody"),
+        (("--env", "CartPole-v1", "--by", "Pump"), 2, "--by Pump is no player: write module:Bot, random, keys or "),
+        (("--env", "CartPole-v1", "--by", "random", "--out", "shown"), 1, "dataset shown has no id of Minari"),
         (("--env", "pumping:Broken", "--by", "random"), 1, "Broken: step raises RuntimeError: the pole is gone"),
         (("--env", "pettingzoo.classic.connect_four_v3", "--by", "random"), 1, "datasets are of one agent"),
     ],
