@@ -413,10 +413,14 @@ def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None
     for name, text in report.constant_texts.items():
         _logger.info("observation component %r is left out (environment.leave_out): it is always %r", name, text)
     if report.spaces is None:
+        # Those of an algorithm with a replay buffer are the same for all actions.
+        actions, others = ("", "") if spec.algorithm.replay else (" and discrete actions", " or continuous actions")
         _logger.warning(
-            "the default settings are those for numbers and discrete actions, because the spaces of environment %s are "
-            "not known: if it has images or continuous actions, name the settings with --set or in a TOML file",
+            "the default settings are those for numbers%s, because the spaces of environment %s are not known: if it "
+            "has images%s, name the settings with --set or in a TOML file",
+            actions,
             spec.environment.id,
+            others,
         )
     leave_out = [*spec.environment.leave_out, *report.constant_texts]
     # An encoder for images that the user has chosen takes no codes.

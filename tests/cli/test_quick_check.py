@@ -102,6 +102,9 @@ def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.Monke
     assert (spaces, defaults) == (None, default_settings(None))
     assert "the check of environment faulty_environments:Faulty-v0 was not done within 0.5 s" in LINES[-2]
     assert "the default settings are those for numbers and discrete actions" in LINES[-1]
+    expected_defaults(RunChoice(env="my-arm", algorithm="sac").spec, NO_MODULES, threading.Event())
+    assert "those for numbers, because" in LINES[-1]
+    assert "if it has images, name" in LINES[-1]
 
 
 @pytest.mark.parametrize(("fault", "convolved"), [("board", True), ("driven board", False)])
