@@ -251,7 +251,7 @@ def checked_spaces(spec: RunSpec, *, fork: bool = False) -> Spaces | None:
     The user has named the modules of the environment. See quick_check. Raises EnvironmentProblemError.
     """
     report = _checked(spec, fork)
-    if problem := report.text_problem(spec):
+    if problem := report.text_problem(spec) or report.code_problem(spec):
         raise EnvironmentProblemError(problem)
     _log_advice(report, spec)
     return report.spaces
@@ -271,6 +271,8 @@ def checked_defaults(
     spec = spec_with(None)
     report = _checked(spec, fork, for_settings=True)
     spaces, defaults = _defaults(report, spec)
+    if problem := report.code_problem(spec):
+        raise EnvironmentProblemError(problem)
     defaults, reason = with_measured_processes(spec_with, defaults, report)
     if reason:
         _logger.info("%s", reason)

@@ -2,6 +2,7 @@
 
 from pydantic import Field
 
+from daedalus.policy.component_inputs import coded_components
 from daedalus.protocol.models import Specification
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
 from daedalus.protocol.spec import RunSpec
@@ -45,6 +46,21 @@ class EnvironmentReport(Specification):
                 f"environment {spec.environment.id}: observation component {name!r} is a text, which the policy cannot "
                 f"read: --set \"environment.leave_out=['{name}']\", or make numbers of it with --wrap MODULE:FUNCTION"
             )
+        return ""
+
+    def code_problem(self, spec: RunSpec) -> str:
+        """Return the problem of a run that observes a value which is no code of `policy.codes`, or an empty string."""
+        observations = {} if self.spaces is None else self.spaces.observations
+        for name, codes in coded_components(spec.policy, observations).items():
+            maxima = self.byte_maxima.get(name, ())
+            each = codes if len(maxima) == len(codes) else (max(codes),)
+            for largest, count in zip(maxima, each, strict=False):
+                if largest >= count:
+                    return (
+                        f"environment {spec.environment.id}: observation component {name!r} has the value {largest} "
+                        f"where policy.codes.{name} has {count} codes, from 0 to {count - 1}: correct the environment, "
+                        "or set higher numbers in policy.codes, or policy.codes=none"
+                    )
         return ""
 
 
@@ -176,7 +192,7 @@ def small_bytes(report: EnvironmentReport, spec: RunSpec) -> str:
         return ""
     for name, maxima in report.byte_maxima.items():
         space, largest = report.spaces.observations.get(name), max(maxima)
-        if not isinstance(space, ArraySpace) or name in {*policy.codes, *report.codes}:
+        if not isinstance(space, ArraySpace) or len(space.shape) == 1 or name in {*policy.codes, *report.codes}:
             continue
         if not 0 < largest < _SMALL_PIXEL or (largest == 1 and not space.is_image):
             continue
@@ -219,8 +235,11 @@ def uninformative_bounds(report: EnvironmentReport) -> str:
 def replay_instead(report: EnvironmentReport, spec: RunSpec) -> str:
     """Return advice to learn from each step many times, where steps are slow and sac can learn, or an empty string.
 
-    Not for a choice, where sac has not been better for the same number of steps (docs/results.md).
+    Not for a choice, where sac has not been better for the same number of steps (docs/results.md), and not where the
+    run has what sac refuses.
     """
+    if spec.policy.memory != "none" or spec.training.curiosity or spec.uploads_gradients:
+        return ""
     fits = report.spaces is not None and report.spaces.fits_replay and report.spaces.only_choice is None
     if report.step_seconds <= _DEAR_SECONDS or not fits or spec.algorithm.replay or spec.environment.is_game:
         return ""

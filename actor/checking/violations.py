@@ -154,5 +154,5 @@ def byte_maxima(spaces: Spaces) -> dict[str, np.ndarray]:
     return {
         name: np.zeros(space.shape[-1] if len(space.shape) == 3 and space.shape[-1] <= _MOST_PLACES else 1, np.uint8)
         for name, space in spaces.observations.items()
-        if isinstance(space, ArraySpace) and space.dtype == "uint8" and len(space.shape) in (2, 3)
+        if isinstance(space, ArraySpace) and space.dtype == "uint8" and 1 <= len(space.shape) <= 3
     }

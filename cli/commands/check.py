@@ -103,7 +103,7 @@ def _checked(choice: RunChoice, spec: RunSpec, seconds: float) -> list[tuple[str
         if spec.environment != environment and report.spaces is not None:
             chosen = _report(replace(check, spec=spec.environment, seconds=0.0, notes=False))
     network, fault = _network(spec, chosen.spaces, modules)
-    problems = [*report.problems, *filter(None, (chosen.text_problem(spec), fault))]
+    problems = [*report.problems, *filter(None, (chosen.text_problem(spec), report.code_problem(spec), fault))]
     return [
         *_description(spec, report),
         *(_choices(spec, network) if chosen.spaces is not None else ()),

@@ -414,9 +414,11 @@ def test_slow_continuous_steps_suggest_sac() -> None:
     arm, choice = ContinuousSpace(low=(-1.0,), high=(1.0,)), DiscreteSpace(counts=(2,))
     free = ContinuousSpace(low=(None,), high=(None,))
 
-    def proposes(action: ContinuousSpace | DiscreteSpace, seconds: float, **training: Any) -> bool:
+    def proposes(
+        action: ContinuousSpace | DiscreteSpace, seconds: float, memory: str = "none", **training: Any
+    ) -> bool:
         spaces = Spaces(observations={"o": ArraySpace(shape=(3,), dtype="float32")}, actions={"a": action})
-        policy = {"distribution": "squashed_gaussian", "state_dependent_std": True}
+        policy = {"distribution": "squashed_gaussian", "state_dependent_std": True, "memory": memory}
         run = RunSpec.model_validate({"environment": {"id": "Any-v0"}, "policy": policy, "training": training})
         found = advice(EnvironmentReport(spaces=spaces, step_seconds=seconds), run, processors=2)
         return any("training.algorithm=sac" in text for text in found)
@@ -424,6 +426,8 @@ def test_slow_continuous_steps_suggest_sac() -> None:
     assert proposes(arm, 0.021)
     assert not proposes(arm, 0.019)
     assert not proposes(arm, 0.021, algorithm="sac")
+    assert not proposes(arm, 0.021, memory="gru")
+    assert not proposes(arm, 0.021, algorithm="appo", curiosity=1.0)
     assert not proposes(choice, 0.021)
     assert not proposes(free, 0.021)
 
@@ -548,6 +552,7 @@ def test_map_whose_planes_may_come_first_is_noted(shape: tuple[int, ...], noted:
 @pytest.mark.parametrize(
     ("value", "policy", "remedy"),
     [
+        (9, {"encoder": "mlp", "codes": {"observation": (9,)}}, "has the value 9 where policy.codes.observation has 9"),
         (3, {}, ", and the encoder divides bytes by 255: if its values are codes, such as kinds of things, and not"),
         (3, {}, "use --set policy.codes.observation=[4] --set policy.encoder=mlp, with as many codes as there can be"),
         (3, {"encoder": "mlp"}, "use --set policy.codes.observation=[4], with as many codes as there can be"),
@@ -565,6 +570,7 @@ def test_image_of_small_values_is_noted(value: int, policy: dict[str, object], r
     assert report.byte_maxima == {"observation": (value,)}
     chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update=policy)})
     notes = [text for text in advice(report, chosen, processors=2) if "policy.codes" in text]
+    notes += filter(None, [report.code_problem(chosen)])
     assert [remedy in text for text in notes] == ([True] if remedy else [])
 
 

@@ -10,7 +10,7 @@ from daedalus.cli.commands.check import check
 
 ENV = ["--env", "faulty_environments:Faulty-v0", "--seconds", "0.05"]
 LONGER = ["--seconds", "1"]  # enough for several steps on a busy machine
-PARAMETER = ["--set", "environment.parameters.stones=7"]
+PATH, PARAMETER = "lesson_environment:PathWithMethod", ["--set", "environment.parameters.stones=7"]
 
 
 @pytest.fixture(autouse=True)
@@ -39,8 +39,14 @@ def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFi
         ),
         (["--set", "policy.encoder=nature"], "problem       the encoder 'nature' takes images"),
         (
-            ["--env", "lesson_environment:PathWithMethod", *LONGER, *PARAMETER, "--set", "lessons.stones.steps=[1,200]"]
-            + ["--set", "lessons.stones.above=1"],
+            [
+                "--env",
+                "lesson_environment:PathWithMethod",
+                *LONGER,
+                *PARAMETER,
+                "--set",
+                "lessons.stones.between=[1,200]",
+            ],
             r"problem       .*: set_parameters\(stones=200\) raises .* change lessons.stones",
         ),
         (

@@ -63,6 +63,16 @@ def test_a_value_of_a_lesson_that_the_environment_refuses_is_a_problem() -> None
         checked_spaces(run(path).model_copy(update={"lessons": lessons}), fork=True)
 
 
+def test_a_value_that_is_no_code_is_a_problem() -> None:
+    grid = RunChoice(
+        env="faulty_environments:Faulty-v0",
+        settings={"environment.kwargs": {"fault": "map", "value": 9}, "policy.codes": {"observation": [9]}},
+    )
+    for check in (lambda: checked_spaces(grid.spec(), fork=True), lambda: checked_defaults(grid.spec, fork=True)):
+        with pytest.raises(EnvironmentProblemError, match=r"the value 9 where policy\.codes\.observation has 9"):
+            check()
+
+
 def test_an_environment_that_ends_its_process_is_a_problem() -> None:
     with pytest.raises(EnvironmentProblemError, match=r"Faulty-v0 ended its process \(status 7\): see what it prints"):
         checked_spaces(run(faulty("crash")))
