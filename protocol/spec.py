@@ -726,6 +726,12 @@ class RunSpec(Specification):
                 f"training.curiosity is for algorithms that learn from new rollouts, but {name} keeps rewards in a "
                 "replay buffer, where they would not fade: set training.curiosity=0"
             )
+        rows = self.collection.rollout_length
+        if self.training.n_step > rows:
+            raise ValueError(
+                f"training.n_step is {self.training.n_step}, but the targets of {name} end with their rollout, and "
+                f"collection.rollout_length is {rows}: set n_step lower, or rollout_length to at least as many"
+            )
         return self
 
     @model_validator(mode="after")

@@ -366,6 +366,7 @@ def test_a_buffer_that_does_not_fit_is_refused_with_what_would() -> None:
         ({"policy": {"distribution": "gaussian"}}, {}, "policy.distribution=squashed_gaussian"),
         ({}, {"normalize_rewards": True}, "environment.reward_scale"),
         ({}, {"curiosity": 0.5}, "training.curiosity=0"),
+        ({}, {"n_step": ROWS + 1}, f"collection.rollout_length is {ROWS}: set n_step lower"),
     ],
 )
 def test_settings_that_replay_cannot_keep_are_refused(
