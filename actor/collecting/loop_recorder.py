@@ -127,7 +127,7 @@ class EpisodeTape:
             if not self._action_space.contains(played):
                 raise ValueError("an action that was played is outside the action space")
             seen = self._copied(self._observation_space, observation)
-        except (ValueError, TypeError, LookupError) as error:
+        except (ValueError, TypeError) as error:
             self.drop()
             self._fault = str(error)
         else:
@@ -138,11 +138,14 @@ class EpisodeTape:
     def _copied(self, space: gymnasium.Space, value: Any) -> Any:
         """Return a value of a space in memory of its own, because loops use arrays again.
 
-        Raises ValueError, TypeError or LookupError if it is none, and ValueError if too much memory is held.
+        Raises ValueError if it is none, or if too much memory is held.
         """
         parts: dict[tuple[str | int, ...], Any] = {}
         for leaf in leaves(space, "value"):
-            given = leaf.of(value)
+            try:
+                given = leaf.of(value)
+            except (TypeError, LookupError):
+                raise ValueError(f"an observation or an action that was played lacks {leaf.name!r}") from None
             parts[leaf.path] = copied = given.astype(leaf.space.dtype)[()]
             if copied.dtype.kind in "iub" and not np.array_equal(copied, given):
                 raise ValueError(f"a value is none of {leaf.space}")
@@ -170,7 +173,7 @@ class EpisodeTape:
             space = self._observation_space
             last = self._observations[-1] if observation is None else self._copied(space, observation)
             self._observations.append(last)
-        except (ValueError, TypeError, LookupError) as error:
+        except (ValueError, TypeError) as error:
             self._fault = str(error)
 
     def finish(self) -> None:

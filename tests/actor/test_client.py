@@ -10,12 +10,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from log_lines import LINES
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner, acknowledge
 
 from daedalus.actor import Client
 from daedalus.actor import client as client_module
 from daedalus.actor.collecting.client_collector import ClientCollector
+from daedalus.actor.collecting.loop_recorder import LoopRecorder
 from daedalus.actor.environments.minari_files import DatasetError, MinariReader
 from daedalus.actor.errors import ActorError
 from daedalus.protocol.codec import encode
@@ -80,6 +82,15 @@ def test_client_records_what_is_played(learner: ScriptedLearner, tmp_path: Path)
         Client("tcp/127.0.0.1:1", **SPACES, record=place)
     with pytest.raises(DatasetError, match=r"cannot be written: .*Not a directory"):
         Client("tcp/127.0.0.1:1", **SPACES, record=place / "data/metadata.json/below")
+
+
+def test_an_episode_that_lacks_a_part_of_an_action_is_not_recorded(tmp_path: Path) -> None:
+    turn = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    tape = LoopRecorder(str(tmp_path / "played")).tape(turn, gymnasium.spaces.Dict({"arm": turn, "hand": turn}))
+    tape.act(np.zeros(1, np.float32), {"arm": np.zeros(1, np.float32)})
+    tape.end(None, terminated=True)
+    tape.finish()
+    assert "not recorded: an observation or an action that was played lacks 'hand';" in LINES[-1]
 
 
 def test_client_may_wait_for_ever(learner: ScriptedLearner) -> None:
