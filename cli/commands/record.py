@@ -132,7 +132,7 @@ def record(arguments: list[str]) -> int:
 
 
 def _unfit_option(parsed: argparse.Namespace) -> str:
-    """Return why an option would have no effect or names no player, or an empty string."""
+    """Return why an option would have no effect or has no fitting value, or an empty string."""
     given = {
         "a RUN_DIR": {"--sampled": parsed.sampled, "--newest": parsed.newest},
         "--by keys or gamepad": {"--key": parsed.key, "--idle": parsed.idle, "--rate": parsed.rate},
@@ -146,7 +146,10 @@ def _unfit_option(parsed: argparse.Namespace) -> str:
                 return f"{option} is for {player}: leave it out"
     if not (parsed.by is None or parsed.by in (_KEYS, _GAMEPAD) or is_bot(parsed.by)):
         return f"--by {parsed.by} is no player: write module:Bot, random, {_KEYS} or {_GAMEPAD}"
-    return "" if parsed.episodes else "--episodes 0 must be at least 1"
+    for option, value, least in (("episodes", parsed.episodes, 1), ("seed", parsed.seed, 0), ("rate", parsed.rate, 1)):
+        if value is not None and value < least:
+            return f"--{option} {value} must be at least {least}"
+    return ""
 
 
 def _actions(parsed: argparse.Namespace) -> tuple[dict[str, Any] | None, Any]:

@@ -138,6 +138,7 @@ def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) 
         (("--env", "CartPole-v1", "--by", "random", "--sampled"), 2, "--sampled is for a RUN_DIR"),
         (("--env", "CartPole-v1", "--by", "keys", "--axis", "leftx=0"), 2, "--axis is for --by gamepad"),
         (("--env", "CartPole-v1", "--by", "random", "--episodes", "0"), 2, "--episodes 0 must be at least 1"),
+        (("--env", "CartPole-v1", "--by", "random", "--seed", "-3"), 2, "--seed -3 must be at least 0"),
         (("--env", "CartPole-v1", "--by", "keys"), 1, "name keys with --key"),
         (("--env", "CartPole-v1", "--by", "gamepad", "--key", "a=1"), 1, "no gamepad is connected"),
         (("--env", "CartPole-v1", "--by", "gamepad", "--axis", "leftx"), 2, "write AXIS=N"),
