@@ -4,13 +4,14 @@ A lesson is about one parameter. The true task has one value for it (`environmen
 An actor draws the value of each episode from the newest plan that it has, so that it needs no answer of the learner.
 """
 
+import numbers
 import re
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, StrictInt, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, model_validator
 
-from daedalus.protocol.models import Specification
+from daedalus.protocol.models import PositiveInt, Specification
 
 MAX_LESSONS = 16  # parameters of one run
 MAX_RANGES = 64  # of one parameter
@@ -18,9 +19,10 @@ _LARGEST = 1e15  # whole numbers up to it are exact in float64
 
 
 def _number(value: object) -> int | float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
+    # Real: also numpy's scalars.
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not abs(value) <= _LARGEST:
         raise ValueError(f"must be a number from -{_LARGEST:g} to {_LARGEST:g}")
-    return value  # an int stays one
+    return int(value) if isinstance(value, numbers.Integral) else float(value)
 
 
 def _parameter_name(value: str) -> str:
@@ -39,7 +41,7 @@ class LessonSpec(Specification):
 
     start: Number | None = None
     """Value at the start of training. It changes linearly to that of the true task."""
-    until_env_steps: Annotated[StrictInt, Field(ge=1)] | None = None
+    until_env_steps: PositiveInt | None = None
     """With `start`: from this many env_steps on, training plays the true task."""
 
     steps: Annotated[tuple[Number, ...], Field(min_length=1, max_length=MAX_RANGES)] | None = None

@@ -50,6 +50,12 @@ def test_a_schedule_ends_at_the_true_task() -> None:
     assert [drawn(whole, env_steps)[0][0] for env_steps in (0, 30, 60)] == [2, 4, 7]
 
 
+def test_numbers_of_lessons_may_be_numpys() -> None:
+    given = spec(np.float32(10.0), start=np.int64(2), until_env_steps=1e2)  # pyright: ignore[reportArgumentType]
+    assert given == spec(10.0, start=2, until_env_steps=100)
+    assert type(given.lessons[NAME].start) is int
+
+
 def test_only_episodes_with_the_present_value_lead_to_the_next_one() -> None:
     lessons = LessonProgress(spec(steps=[1.0, 5.0], above=0.5))
     lessons.add([episodes((1.0, 1.0), (1.0, 1.0), (1.0, 0.0))], 7)
