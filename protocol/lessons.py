@@ -19,10 +19,11 @@ _LARGEST = 1e15  # whole numbers up to it are exact in float64
 
 
 def _number(value: object) -> int | float:
-    # Real: also numpy's scalars.
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not abs(value) <= _LARGEST:
-        raise ValueError(f"must be a number from -{_LARGEST:g} to {_LARGEST:g}")
-    return int(value) if isinstance(value, numbers.Integral) else float(value)
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):  # also numpy's scalars
+        number = int(value) if isinstance(value, numbers.Integral) else float(value)
+        if abs(number) <= _LARGEST:
+            return number
+    raise ValueError(f"must be a number from -{_LARGEST:g} to {_LARGEST:g}")
 
 
 def _parameter_name(value: str) -> str:
