@@ -1,10 +1,10 @@
 """Replay buffer: the newest transitions of all rollouts, for an algorithm that learns from each more than once.
 
-State in main memory; no I/O, no threads.
+State in main memory, and frames where they are asked for; no I/O, no threads.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from torch import Tensor
 from daedalus.policy.network.layers import Components
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.uploads import Rollout
+
+_DTYPES = {"float32": torch.float32, "uint8": torch.uint8, "uint16": torch.uint16}
 
 
 class Transitions(NamedTuple):
@@ -49,24 +51,29 @@ class ReplayBuffer:
     bootstraps there. Reset rows are never sampled, and overridden rows by `sample_taught` alone, if they teach.
     """
 
-    def __init__(self, spaces: Spaces, rollout_length: int, capacity: int) -> None:
-        """Allocate an empty buffer. The system gives the memory when it is first written to.
+    def __init__(
+        self, spaces: Spaces, rollout_length: int, capacity: int, device: Literal["cpu", "cuda"] = "cpu"
+    ) -> None:
+        """Allocate an empty buffer. The system gives main memory when it is first written to, and a GPU all at once.
 
         Args:
           spaces: components of observations and actions.
           rollout_length: T, rows of a column.
           capacity: rows, rounded up to columns.
+          device: holds the frames, and those of a sample; the rest is in main memory.
+
+        Raises torch.OutOfMemoryError if the device has no room for the frames.
         """
         self._rows, self.columns = rollout_length, -(-capacity // rollout_length)
-        self._depths = {name: space.frames for name, space in spaces.observations.items()}
-        self._discrete = {name for name, space in spaces.observations.items() if isinstance(space, DiscreteSpace)}
-        self._action_names = tuple(spaces.actions)
+        self._spaces, self._action_names = spaces.observations, tuple(spaces.actions)
         cells = (self.columns, rollout_length)
-        self._arrays = {  # what a column is made of, by name; the first axis is that of the columns
-            **{
-                f"frames/{name}": np.zeros((self.columns, space.frames + rollout_length, *space.shape), space.dtype)
-                for name, space in spaces.observations.items()
-            },
+        # The first axis of all is that of the columns. Frames are bytes, for all data types: torch takes rows of them
+        # several times faster than numpy.
+        self._frames = {
+            name: _zeros((self.columns, space.frames + rollout_length, space.frame_bytes), device)
+            for name, space in spaces.observations.items()
+        }
+        self._arrays = {  # the rest of a column, by name
             "actions": np.zeros((*cells, sum(space.size for space in spaces.actions.values())), np.float32),
             "rewards": np.zeros(cells, np.float32),
             "terminated": np.zeros(cells, np.bool_),
@@ -76,7 +83,7 @@ class ReplayBuffer:
             # Of each observation: how many frames before it are of its episode, at most those in a stack.
             "ages": np.zeros((self.columns, rollout_length + 1), np.uint8),
         }
-        self._most_frames = max(self._depths.values())
+        self._most_frames = max(space.frames for space in spaces.observations.values())
         self._queues = {name: _Rows(cells) for name in ("learned", "taught")}
         self.columns_added = 0  # ever
 
@@ -127,8 +134,11 @@ class ReplayBuffer:
         """Add columns, or the last ones if they are more than the buffer has: each array [columns, ...] of `copied`."""
         arrays = {name: values[-self.columns :] for name, values in arrays.items()}
         at = (self.columns_added + np.arange(len(arrays["learned"]))) % self.columns
-        for name, values in arrays.items():
-            self._arrays[name][at] = values
+        for name, values in self._arrays.items():
+            values[at] = arrays[name]
+        for name, frames in self._frames.items():
+            added = np.array(arrays[f"frames/{name}"], order="C").reshape(len(at), frames.shape[1], -1)
+            frames[torch.from_numpy(at)] = torch.from_numpy(added.view(np.uint8)).to(frames.device)
         for name, queue in self._queues.items():
             queue.replace(at, arrays[name])
         self.columns_added += len(at)
@@ -136,11 +146,22 @@ class ReplayBuffer:
     def copied(self, first: int, last: int) -> dict[str, np.ndarray]:
         """Return copies of the columns `first` to `last` - 1, counted over all that ever were added; each is held."""
         at = np.arange(first, last) % self.columns
-        return {name: values[at] for name, values in self._arrays.items()}
+        arrays = {name: values[at] for name, values in self._arrays.items()}
+        for name, (shape, dtype) in self._shapes_of_frames().items():
+            taken = self._frames[name][torch.from_numpy(at)].cpu().numpy()
+            arrays[f"frames/{name}"] = taken.view(dtype).reshape(len(at), *shape)
+        return arrays
 
     def shapes(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
         """Return shape and data type of each array of one column, by name."""
-        return {name: (values.shape[1:], values.dtype) for name, values in self._arrays.items()}
+        frames = {f"frames/{name}": each for name, each in self._shapes_of_frames().items()}
+        return frames | {name: (values.shape[1:], values.dtype) for name, values in self._arrays.items()}
+
+    def _shapes_of_frames(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+        return {
+            name: ((space.frames + self._rows, *space.shape), np.dtype(space.dtype))
+            for name, space in self._spaces.items()
+        }
 
     def sample(self, count: int, n_step: int, discount_factor: float) -> Transitions:
         """Return transitions of rows drawn uniformly, with torch's random numbers; the buffer is not empty.
@@ -177,8 +198,10 @@ class ReplayBuffer:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the full buffer takes, in bytes."""
-        return sum(values.nbytes for values in self._arrays.values()) + 8 * self.capacity  # and the queue of its rows
+        """Main memory that the full buffer takes, in bytes."""
+        held = [frames.nbytes for frames in self._frames.values() if frames.device.type == "cpu"]
+        held += [values.nbytes for values in self._arrays.values()]
+        return sum(held) + 8 * self.capacity  # and the queue of its rows
 
     @property
     def learned_rows(self) -> np.ndarray:
@@ -188,19 +211,25 @@ class ReplayBuffer:
     def _observations(self, columns: np.ndarray, rows: np.ndarray) -> Components:
         """Return the observations of rows, with their stacks."""
         found: Components = {}
-        for name, depth in self._depths.items():
-            frames = self._arrays[f"frames/{name}"]
+        for name, space in self._spaces.items():
+            frames, depth = self._frames[name], space.frames
             newest = columns * frames.shape[1] + rows + (depth - 1)
             if depth > 1:
                 # The first frame of an episode replaces those before it: see protocol/frames.py.
                 back = np.minimum(np.arange(depth - 1, -1, -1), self._arrays["ages"][columns, rows][:, None])  # [B, k]
                 newest = newest[:, None] - back
-            # As bytes, for all data types: torch takes rows of them several times faster than numpy.
-            flat = torch.from_numpy(frames.reshape(frames.shape[0] * frames.shape[1], -1).view(np.uint8))
-            taken = flat.index_select(0, torch.from_numpy(newest.ravel())).numpy().view(frames.dtype)
-            values = taken.reshape(*newest.shape, *frames.shape[2:])
-            found[name] = torch.from_numpy(values.astype(np.int64) if name in self._discrete else values)
+            at = torch.from_numpy(newest.ravel()).to(frames.device)
+            taken = frames.flatten(0, 1).index_select(0, at).view(_DTYPES[space.dtype])
+            values = taken.view(*newest.shape, *space.shape)
+            found[name] = values.long() if isinstance(space, DiscreteSpace) else values
         return found
+
+
+def _zeros(shape: tuple[int, ...], device: str) -> Tensor:
+    """Return bytes. In main memory they are numpy's, to which the system gives no memory before they are written."""
+    if device == "cpu":
+        return torch.from_numpy(np.zeros(shape, np.uint8))
+    return torch.zeros(shape, dtype=torch.uint8, device=device)
 
 
 class _Rows:

@@ -143,7 +143,12 @@ class ArraySpace(Specification):
     @property
     def observation_bytes(self) -> int:
         """Size of one stacked observation."""
-        return math.prod(self.stacked_shape) * (4 if self.dtype == "float32" else 1)
+        return self.frames * self.frame_bytes
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of one frame."""
+        return math.prod(self.shape) * (4 if self.dtype == "float32" else 1)
 
     @property
     def image_shape(self) -> tuple[int, int, int]:
@@ -208,6 +213,11 @@ class DiscreteSpace(Specification):
     def dtype(self) -> Literal["uint8", "uint16"]:
         """Data type of values in messages."""
         return "uint8" if max(self.counts) <= 256 else "uint16"
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of a value in messages."""
+        return len(self.counts) * (1 if self.dtype == "uint8" else 2)
 
     def __str__(self) -> str:
         masked = ", masked" if self.masked else ""
@@ -370,13 +380,13 @@ class Spaces(Specification):
         }
         return self.model_copy(update={"actions": actions})
 
+    def frame_bytes(self, rows: int) -> int:
+        """Return the size of the frames of some rows of one environment, with those before and after them."""
+        return sum((space.frames + rows) * space.frame_bytes for space in self.observations.values())
+
     def replay_bytes(self, rows: int) -> int:
         """Return the memory of some rows of one environment in a replay buffer (algorithms/replay_buffer.py)."""
-        frames = sum(
-            (space.frames + rows) * math.prod(space.shape) * np.dtype(space.dtype).itemsize
-            for space in self.observations.values()
-        )
-        return frames + rows * (4 * sum(space.size for space in self.actions.values()) + _REPLAY_BYTES)
+        return self.frame_bytes(rows) + rows * (4 * sum(space.size for space in self.actions.values()) + _REPLAY_BYTES)
 
     @property
     def listed_actions(self) -> str:

@@ -1,10 +1,12 @@
 """The learner of an algorithm with a replay buffer: rollouts go into it, and minibatches of it make the updates."""
 
 import contextlib
+import logging
 import math
 import secrets
 import time
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,6 +27,8 @@ from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout, Upload
 from daedalus.transport.process_usage import available_memory
 
+_logger = logging.getLogger(__name__)
+
 _SLICE_SECONDS = 0.5  # of updates at a time: evaluators, orders and signals wait meanwhile
 _MEMORY_SHARE = 0.75  # of what is available, where the run does not say
 
@@ -39,8 +43,8 @@ class ReplayLearner(Learner):
     def __init__(self, run: RunSpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
         """Construct the learner at policy version 0. Raises as Learner, and SettingsError for too large a buffer."""
         spec = run.training
-        self.replay = build_replay_buffer(spec, spaces, run.collection.rollout_length)
         super().__init__(spec, run.policy, spaces, modules)
+        self.replay = build_replay_buffer(spec, spaces, run.collection.rollout_length)
         algorithm = self._gradients.algorithm
         assert isinstance(algorithm, Sac)
         mixed = is_mixed(spec.precision, self.device, self._network.convolutional)
@@ -126,16 +130,15 @@ class ReplayLearner(Learner):
         rows = self._spec.minibatch_rows
         while rows := rows // 2:
             with contextlib.suppress(torch.OutOfMemoryError):
-                self._algorithm.gradients(_moved(self._sampled(rows), self.device))
+                self._algorithm.gradients(self._sampled(rows))
                 return rows
         return 0
 
     def _update(self, progress: float) -> None:
         """Make one update, or skip it if a gradient is not finite."""
         spec = self._spec
-        transitions = self._sampled(spec.minibatch_rows)
         of_policy = self.policy_version % POLICY_PERIOD == 0
-        gradients, terms = self._algorithm.gradients(_moved(transitions, self.device), of_policy=of_policy)
+        gradients, terms = self._algorithm.gradients(self._sampled(spec.minibatch_rows), of_policy=of_policy)
         norms = {name: float(torch.linalg.vector_norm(gradient)) for name, gradient in gradients.items()}
         self.policy_version += 1
         if not all(map(math.isfinite, norms.values())):
@@ -163,7 +166,8 @@ class ReplayLearner(Learner):
         counts = {self.replay.sample: rows - shown, self.replay.sample_taught: helped}
         if self.demonstrations is not None:
             counts[self.demonstrations.sample] = shown - helped
-        return joined([draw(count, spec.n_step, spec.discount_factor) for draw, count in counts.items() if count])
+        drawn = (draw(count, spec.n_step, spec.discount_factor) for draw, count in counts.items() if count)
+        return joined([_moved(part, self.device) for part in drawn])
 
     def entropy_bonus(self, progress: float) -> float:
         """Return the weight of the entropy: the temperature, which is learned."""
@@ -178,11 +182,17 @@ class ReplayLearner(Learner):
 
 
 def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int) -> ReplayBuffer:
-    """Return an empty buffer. Raises SettingsError, with how many transitions would fit, if it is too large."""
+    """Return an empty buffer. With a GPU its frames are there, if they fit into half of what is free.
+
+    Raises SettingsError, with how many transitions would fit, if it is too large.
+    """
     # An env_step is followed by a reset row at most; or a person helps in as many.
     capacity = min(spec.replay_transitions, 2 * spec.env_steps)
-    column = spaces.replay_bytes(rollout_length)
     columns = -(-capacity // rollout_length)
+    column, frames = spaces.replay_bytes(rollout_length), spaces.frame_bytes(rollout_length)
+    device = _device_of_frames(spec, columns * frames)
+    if spec.replay_megabytes is None and device == "cuda":
+        column -= frames
     if spec.replay_megabytes is not None:
         most, whose = int(spec.replay_megabytes * 2**20), "training.replay_megabytes allows"
     else:
@@ -196,7 +206,21 @@ def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int)
             f"a replay buffer of {capacity:,} transitions takes {columns * column / 2**20:,.0f} MiB, and {whose} "
             f"{most / 2**20:,.0f} MiB: {fitting:,} transitions fit; {remedy}"
         )
-    return ReplayBuffer(spaces, rollout_length, capacity)
+    return ReplayBuffer(spaces, rollout_length, capacity, device)
+
+
+def _device_of_frames(spec: TrainingSpec, size: int) -> Literal["cpu", "cuda"]:
+    """Return where frames of so many bytes are kept: on the GPU of the learner, if they take at most half of it."""
+    if spec.device == "cpu":
+        return "cpu"
+    half = torch.cuda.mem_get_info()[0] // 2
+    _logger.info(
+        "replay buffer: its frames are %s, with %s MiB; half of the GPU's free memory is %s MiB",
+        "on the GPU" if size <= half else "in main memory",
+        f"{size / 2**20:,.0f}",
+        f"{half / 2**20:,.0f}",
+    )
+    return "cuda" if size <= half else "cpu"
 
 
 def _moved(transitions: Transitions, device: torch.device) -> Transitions:

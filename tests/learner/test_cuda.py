@@ -10,6 +10,7 @@ import torch
 from building import ENVIRONMENTS, ROWS, SPACES, make_rollout, run_spec
 from plain import NAME, act, array_space
 
+from daedalus.algorithms.replay_buffer import ReplayBuffer
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.checkpoint import encode_checkpoint, load_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
@@ -113,3 +114,19 @@ def test_mixed_precision_changes_all_parameters(monkeypatch: pytest.MonkeyPatch)
     for name, array in there.weights().items():
         assert np.isfinite(array).all()
         assert not np.array_equal(array, start[name]), name
+
+
+def test_a_replay_buffer_on_cuda_samples_what_one_in_main_memory_does() -> None:
+    here, there = (ReplayBuffer(IMAGES, ROWS, 8 * ROWS, device) for device in ("cpu", "cuda"))
+    for seed in range(6):
+        for rollout in rollouts(seed, IMAGES, 0):
+            here.add(rollout)
+            there.add(rollout)
+    assert there.nbytes < here.nbytes
+    rows = here.learned_rows
+    expected, found = (buffer.transitions(rows, 3, 0.9) for buffer in (here, there))
+    assert found.observations[NAME].device.type == "cuda"
+    for mine, theirs in zip((expected.observations, expected.next_observations), found[:2], strict=True):
+        torch.testing.assert_close(theirs[NAME].cpu(), mine[NAME])
+    for name, values in there.copied(4, 8).items():
+        np.testing.assert_array_equal(values, here.copied(4, 8)[name])

@@ -17,7 +17,7 @@ from daedalus.learner.run.resuming import CheckpointMismatchError
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training import replay_files
 from daedalus.learner.training.replay_files import FOLDER, ReplayFiles
-from daedalus.learner.training.replay_learner import ReplayLearner
+from daedalus.learner.training.replay_learner import ReplayLearner, build_replay_buffer
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
@@ -356,6 +356,18 @@ def test_a_buffer_that_does_not_fit_is_refused_with_what_would() -> None:
     ReplayLearner(spec_of(replay_megabytes=4.0, replay_transitions=fitting), SPACES)
     with pytest.raises(SettingsError, match="fit"):
         ReplayLearner(spec_of(replay_megabytes=4.0, replay_transitions=fitting + ROWS), SPACES)
+
+
+def test_frames_that_take_more_than_half_of_a_gpu_stay_in_main_memory(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    spec = spec_of(replay_transitions=64).training
+    on_cpu = build_replay_buffer(spec, SPACES, ROWS)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (2 * on_cpu.columns * SPACES.frame_bytes(ROWS) - 1, 0))
+    beside_gpu = build_replay_buffer(spec.model_copy(update={"device": "cuda"}), SPACES, ROWS)
+    assert beside_gpu.nbytes == on_cpu.nbytes
+    assert "its frames are in main memory" in caplog.text
 
 
 @pytest.mark.parametrize(
