@@ -12,6 +12,7 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.running_returns import RunningReturns
+from daedalus.policy.network.layers import OneHotCodes
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.protocol.keys import first_of_largest_owner, owner
 from daedalus.protocol.uploads import Rollout
@@ -415,8 +416,8 @@ def observations_name(component: str) -> str:
 class ObservationStatistics:
     """The statistics of a network's ObservationNormalizer, updated from batches."""
 
-    def __init__(self, normalizer: ObservationNormalizer) -> None:
-        self._normalizer = normalizer
+    def __init__(self, normalizer: ObservationNormalizer, codes: OneHotCodes) -> None:
+        self._normalizer, self._codes = normalizer, codes
         self.moments = {
             name: RunningMoments(tuple(scale.shape))
             for name, scale in zip(normalizer.names, normalizer.scales, strict=True)
@@ -433,7 +434,11 @@ class ObservationStatistics:
     def moments_of(self, batch: Batch, columns: slice = slice(None)) -> dict[str, Moments]:
         """Return the moments of the observations of the valid rows of some environments, by component."""
         rows = batch.valid[:, columns].bool()
-        return {name: moments_of(batch.observations[name][:-1, columns][rows]) for name in self.moments}
+        return self._moments_of({name: batch.observations[name][:-1, columns][rows] for name in self.moments})
+
+    def _moments_of(self, observations: Mapping[str, Tensor]) -> dict[str, Moments]:
+        encoded = self._codes({name: observations[name] for name in self.moments})
+        return {name: moments_of(values) for name, values in encoded.items()}
 
     def merge(self, parts: Mapping[str, Sequence[Moments]], ranges: ConfirmedRanges) -> None:
         """Add observations by the moments of their rollouts, by component, and set the normaliser's statistics.
@@ -446,8 +451,9 @@ class ObservationStatistics:
 
     def add(self, observations: Mapping[str, Tensor]) -> None:
         """Add observations that nobody doubts, by component [N, *stacked_shape], and set the statistics."""
-        for name, moments in self.moments.items():
-            moments.merge(moments_of(observations[name]))
+        for name, others in self._moments_of(observations).items():
+            moments = self.moments[name]
+            moments.merge(others)
             self._normalizer.set_statistics(name, moments.mean, moments.variance)
 
     def reset(self) -> None:

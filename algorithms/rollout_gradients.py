@@ -43,7 +43,7 @@ class RolloutGradients:
             self._network = ActorCritic(spec.policy, spaces, modules, training)
         self._computer = GradientComputer(training, self._network, spaces, modules)
         self._assembler = BatchAssembler(spaces, torch.device("cpu"))
-        self._observations = ObservationStatistics(self._network.normalizer)
+        self._observations = ObservationStatistics(self._network.normalizer, self._network.codes)
         self._rewards: RewardNormalizer | None = None
         if training.normalize_rewards:
             self._rewards = RewardNormalizer(training.discount_factor, synchronous=training.record.synchronous)

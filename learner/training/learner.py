@@ -194,7 +194,7 @@ class Learner:
         self.graphs = UpdateGraphs(self.device, can_record=built_in and not changes)
         self._pending: _Pending | None = None  # the newest batch, until it is known that its gradients were finite
         self._assembler = BatchAssembler(spaces, self.device)
-        self._observations = ObservationStatistics(self._network.normalizer)
+        self._observations = ObservationStatistics(self._network.normalizer, self._network.codes)
         self._rewards: RewardNormalizer | None = None
         if spec.normalize_rewards:
             self._rewards = RewardNormalizer(spec.discount_factor, synchronous=spec.record.synchronous)

@@ -20,7 +20,7 @@ _POLICY_GAIN = 0.01  # the initial policy is nearly uniform for every observatio
 
 
 class ActorCritic(nn.Module):
-    """Normaliser and codes, encoder, memory, policy head with the distribution of actions, value head.
+    """Codes and normaliser, encoder, memory, policy head with the distribution of actions, value head.
 
     Learning calls `forward`; acting needs only `act`, which is what the exported program computes. For an algorithm of
     action values, the outputs of the policy head are Q(s, a), and there is no value head.
@@ -83,8 +83,8 @@ class ActorCritic(nn.Module):
         return self.unroll(self.prepare(observations), state, starts)
 
     def prepare(self, observations: Components) -> Components:
-        """Normalise numbers and make codes one-hot: {name: [..., *stacked_shape]}, for any leading axes."""
-        return self.codes(self.normalizer(observations))
+        """Make codes one-hot and normalise numbers: {name: [..., *stacked_shape]}, for any leading axes."""
+        return self.normalizer(self.codes(observations))
 
     def unroll(self, prepared: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         """Compute policies and values for R consecutive rows of B environments from prepared observations.

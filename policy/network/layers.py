@@ -44,9 +44,11 @@ class OneHotCodes(nn.Module):
             self._tables[name] = places, values.float(), torch.tensor(counts)[places].float()
 
     def forward(self, observations: Components) -> Components:
-        """Encode the components that are codes; others are left as they are."""
+        """Encode those of the given components that are codes; others are left as they are."""
         encoded = dict(observations)
         for name, tables in self._tables.items():
+            if name not in observations:
+                continue
             if tables[0].device != observations[name].device:  # once
                 places, values, counts = (table.to(observations[name].device) for table in tables)
                 self._tables[name] = tables = places, values, counts

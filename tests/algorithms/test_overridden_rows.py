@@ -16,6 +16,7 @@ from torch import Tensor
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.layers import OneHotCodes
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 from daedalus.protocol.uploads import Rollout
 
@@ -157,7 +158,7 @@ def test_action_values_are_learned_between_overrides(algorithm: str, policy: Pol
 def test_statistics_are_of_the_rows_to_learn_from() -> None:
     rollout = rollout_with_overrides(0)
     policy = POLICY.model_copy(update={"normalize_observations": True})
-    statistics = ObservationStatistics(ActorCritic(policy, SPACES).normalizer)
+    statistics = ObservationStatistics(ActorCritic(policy, SPACES).normalizer, OneHotCodes({}))
     assert statistics.moments_of(join([rollout]))["observation"].number == rollout.env_steps
     assert RewardNormalizer(GAMMA).moments_of([rollout]).number == rollout.env_steps
     assert rollout.overridden is not None

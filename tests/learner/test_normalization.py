@@ -23,6 +23,7 @@ from daedalus.algorithms.normalization import (
 from daedalus.algorithms.running_returns import Streams
 from daedalus.policy.component_inputs import normalized_components
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.encoders import build_codes
 from daedalus.policy.network.observation_normalizer import ObservationNormalizer
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
@@ -231,24 +232,28 @@ def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None
     spaces = {
         NAME: ArraySpace(shape=(3,), dtype="float32"),
         "bytes": ArraySpace(shape=(2,), dtype="uint8"),
+        "kinds": ArraySpace(shape=(2, 1), dtype="uint8"),
         "image": ArraySpace(shape=(16, 16), dtype="uint8"),
         "choice": DiscreteSpace(counts=(3,)),
     }
-    normalizer = ObservationNormalizer(normalized_components(PolicySpec(normalize_observations=True), spaces))
-    assert normalizer.names == (NAME, "bytes")
-    statistics = ObservationStatistics(normalizer)
-    random, seen = np.random.default_rng(2), {NAME: [], "bytes": []}
+    policy = PolicySpec(normalize_observations=True, codes={"kinds": (4,)})
+    normalizer = ObservationNormalizer(normalized_components(policy, spaces))
+    assert normalizer.names == (NAME, "bytes", "kinds")
+    statistics = ObservationStatistics(normalizer, build_codes(policy, spaces))
+    random, seen = np.random.default_rng(2), {NAME: [], "bytes": [], "kinds": []}
     for seed in range(3):
         rollout = make_rollout(seed=seed)
         more = {
             "bytes": random.integers(0, 256, (7, 3, 2), np.uint8),
+            "kinds": random.integers(0, 4, (7, 3, 2, 1), np.uint8),
             "image": random.integers(0, 256, (7, 3, 16, 16), np.uint8),
             "choice": random.integers(0, 3, (7, 3, 1), np.uint8),
         }
         rollout = replace(rollout, frames={NAME: plain(rollout.frames), **more})
         observe(statistics, join([rollout], Spaces(observations=spaces, actions=ACTIONS)))
         for name, values in seen.items():
-            values.append(rollout.frames[name][:-1][rollout.valid])
+            frames = rollout.frames[name][:-1][rollout.valid]
+            values.append(frames == np.arange(4) if name == "kinds" else frames)  # as one-hot numbers
     for name, values in seen.items():
         mean, variance = normalizer.statistics(name)
         np.testing.assert_allclose(mean, np.concatenate(values).astype(np.float64).mean(0), rtol=1e-4)
@@ -261,7 +266,7 @@ def test_statistics_that_came_with_weights_change_slowly() -> None:
     spaces = Spaces(observations={NAME: ArraySpace(shape=(3,), dtype="float32")}, actions=ACTIONS)
     network = ActorCritic(POLICY.model_copy(update={"normalize_observations": True}), spaces)
     network.normalizer.set_statistics(NAME, torch.full((3,), 50.0), torch.full((3,), 4.0))
-    statistics = ObservationStatistics(network.normalizer)
+    statistics = ObservationStatistics(network.normalizer, network.codes)
     statistics.take_from_network()
     observe(statistics, join([make_rollout()]))
     mean, variance = network.normalizer.statistics(NAME)

@@ -65,7 +65,7 @@ IMAGE = ArraySpace(shape=(16, 16, 3), dtype="uint8")
         ("impala", {"bytes": BYTES}, set()),  # its first convolution scales bytes itself
         ("impala", {"numbers": NUMBERS}, {"numbers"}),
         ("impala", {"bytes": BYTES, "image": IMAGE}, {"bytes"}),  # the multilayer perceptron reads them
-        ("auto", {"coded": BYTES, "bytes": BYTES}, {"bytes"}),
+        ("auto", {"coded": BYTES, "bytes": BYTES}, {"coded", "bytes"}),  # as one-hot numbers
         ("grid", {"map": BYTES, "bytes": ArraySpace(shape=(4,), dtype="uint8")}, {"bytes"}),
         ("module:Own", {"bytes": BYTES}, set()),
         ("module:Own", {"bytes": BYTES, "numbers": NUMBERS, "choice": DiscreteSpace(counts=(3,))}, {"numbers"}),
