@@ -218,8 +218,9 @@ class PolicySpec(Specification):
     activation: Literal["tanh", "relu"] = "tanh"
     """Activation function; the `mlp` and `grid` encoders only."""
     normalize_observations: bool = False
-    """Shift and scale observations to mean 0 and standard deviation 1, by running statistics. Codes, what a convolution
-    of the `grid` encoder reads, and bytes (`uint8`) that an image encoder or your own encoder reads are left out."""
+    """Shift and scale observations to mean 0 and standard deviation 1, by running statistics; of codes, the one-hot
+    numbers. What a convolution of the `grid` encoder reads, and bytes (`uint8`) that an image encoder or your own
+    encoder reads are left out."""
     distribution: Annotated[
         str, Field(pattern=r"^(gaussian|squashed_gaussian|gaussian_mixture|kumaraswamy|[\w.]+:\w+)$", max_length=200)
     ] = "gaussian"

@@ -471,7 +471,8 @@ def test_settings_that_nothing_reads_are_known(settings: dict[str, Any], unread:
         ({"encoder": "mlp"}, (IMAGE,), CONTINUOUS, ""),
         ({"encoder": "own:Encoder"}, (NUMBERS,), DISCRETE, OF_DISTRIBUTIONS),
         ({"encoder": "small"}, (NUMBERS,), CONTINUOUS, OF_LAYERS),
-        ({"codes": {"0": [3]}}, (CELLS,), CONTINUOUS, "policy.normalize_observations"),
+        ({"codes": {"0": [3]}}, (CELLS,), CONTINUOUS, ""),
+        ({"codes": {"0": [3]}, "encoder": "grid"}, (CELLS,), CONTINUOUS, "policy.normalize_observations"),
     ],
 )
 def test_settings_of_a_network_that_nothing_reads_depend_on_the_spaces(
