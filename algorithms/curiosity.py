@@ -32,9 +32,8 @@ _logger = logging.getLogger(__name__)
 class FirstVisits:
     """The observations that the running episodes have had, and so which rows lead to one that is new in its episode.
 
-    Two observations are the same if their newest frames have the same bytes. An episode goes on from rollout to rollout
-    of its environment. One whose earlier rollouts are not known, because they were dropped or came before a restart of
-    the learner, begins without observations.
+    Two observations are the same if their newest frames have the same bytes. An episode whose earlier rollouts were
+    dropped, or came before a restart of the learner, begins without observations.
     """
 
     def __init__(self, *, synchronous: bool = False) -> None:
@@ -44,10 +43,7 @@ class FirstVisits:
         self._has_warned = False
 
     def add(self, rollout: Rollout) -> np.ndarray:
-        """Return 1 for the rows whose next observation is new in its episode, else 0: float32 [T, E].
-
-        It is 0 for reset rows. Call once for each rollout, in order.
-        """
+        """Return 1 where the next observation is new in its episode, else 0: [T, E]. Call once a rollout, in order."""
         seen = self._streams.take(rollout)
         if seen is None or len(seen) != rollout.environments:
             seen = [set[int]() for _ in range(rollout.environments)]
@@ -90,17 +86,13 @@ class Curiosity:
 
         b_t = w min(1 / d, 10) min(4 v, 1) max(1 - 2 f, 0) if s_{t+1} is new in its episode, else 0
 
-    with a weight w, d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for the
-    rewards of the environment (RewardNormalizer), v the deviation of the number of different observations of an
-    episode, over the newest 100: where all episodes have equally many, no way to act finds more, and their order is
-    noise that hides the rewards of the environment. Where each episode has another map, this term alone explores as
-    well as together with the prediction errors that it was added to at first: Wang et al. (2023), "Revisiting Intrinsic
-    Reward for Exploration in Procedurally Generated Environments". Where nearly every observation is new, the term
-    would reward long episodes alone: after the first rows it is 0, until the run is resumed.
-
-    f is how far the mean return of the newest 100 episodes has fallen below its best, in deviations of the returns at
-    that time: a policy that explores for its own sake, and never ends an episode, is not what the run is for. The bound
-    is that of Chen et al. (2022), "Redeeming Intrinsic Rewards via Constrained Optimization", by this simpler rule.
+    w is the weight, and d the running deviation of the discounted sum of first visits, or a fifth of its mean, as for
+    the rewards of the environment (RewardNormalizer). v is the deviation of the number of different observations of an
+    episode, over the newest 100: where it is 0, no way to act finds more. f is how far the mean return of the newest
+    100 episodes is below its best, in deviations of the returns at that time; after Chen et al. (2022), "Redeeming
+    Intrinsic Rewards via Constrained Optimization". Where nearly every observation is new, b would reward long episodes
+    alone: after the first rows it is 0, until a resume. Where each episode has another map, prediction errors add
+    nothing: Wang et al. (2023), "Revisiting Intrinsic Reward for Exploration in Procedurally Generated Environments".
     """
 
     def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:
