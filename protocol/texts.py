@@ -183,3 +183,12 @@ def exact_number(value: float | None) -> str:
     if value is None:
         return ""
     return str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
+
+
+def mebibytes(*sizes: int) -> list[str]:
+    """Return sizes, in bytes, in MiB: with as many decimals as it takes to tell different ones apart, and from 0."""
+    for decimals in range(20):
+        texts = [f"{size / 2**20:,.{decimals}f}" for size in sizes]
+        if len({f"{0.0:.{decimals}f}", *texts}) == len({0, *sizes}):
+            return texts
+    return [f"{size / 2**20:,.20f}" for size in sizes]  # exact

@@ -19,6 +19,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.messages import UNKNOWN, ClientReport, Origin, Snapshot, Welcome
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import ActorSpec
+from daedalus.protocol.texts import mebibytes
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _logger = logging.getLogger(__name__)
@@ -440,9 +441,9 @@ def _as_the_learner(spaces: Spaces, welcome: Welcome) -> Spaces:
 def _check_size(payload: bytes, spec: ActorSpec) -> None:
     """Raise ActorError if the learner does not receive messages of this size: they would be lost in silence."""
     if len(payload) > spec.max_upload_bytes:
+        size, most = mebibytes(len(payload), spec.max_upload_bytes)
         raise ActorError(
-            f"a rollout of this actor has {len(payload) / 2**20:.1f} MiB, and the learner takes at most "
-            f"{spec.max_upload_bytes / 2**20:g} MiB: set fewer environments (collection.envs_per_actor, "
-            "or --envs of daedalus actor) or shorter rollouts (collection.rollout_length), or raise "
-            "service.queue_megabytes of the run"
+            f"a rollout of this actor has {size} MiB, and the learner takes at most {most} MiB: set fewer environments "
+            "(collection.envs_per_actor, or --envs of daedalus actor) or shorter rollouts (collection.rollout_length), "
+            "or raise service.queue_megabytes of the run"
         )

@@ -19,7 +19,7 @@ from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
-from daedalus.protocol.texts import exact_number
+from daedalus.protocol.texts import mebibytes
 from daedalus.protocol.uploads import Rollout
 from daedalus.transport.process_usage import available_memory
 
@@ -62,10 +62,10 @@ def check_memory(steps: int, size: int, taken: int = 0) -> None:
     most = max(int(MEMORY_SHARE * available) - taken, 0)
     if size > most:
         fitting = int(steps * (most / size))
+        needed, left = mebibytes(size, most)
         raise SettingsError(
-            f"demonstrations of {steps:,} steps take {exact_number(round(size / 2**20))} MiB of memory, and "
-            f"{exact_number(round(most / 2**20))} MiB are left for them: {fitting:,} steps fit; use a smaller dataset, "
-            "or set training.replay_transitions lower"
+            f"demonstrations of {steps:,} steps take {needed} MiB of memory, and {left} MiB are left for them: "
+            f"{fitting:,} steps fit; use a smaller dataset, or set training.replay_transitions lower"
         )
 
 

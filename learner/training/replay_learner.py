@@ -24,6 +24,7 @@ from daedalus.policy.network.layers import map_components
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec, TrainingSpec
+from daedalus.protocol.texts import mebibytes
 from daedalus.protocol.uploads import Rollout, Upload
 from daedalus.transport.process_usage import available_memory
 
@@ -202,9 +203,10 @@ def build_replay_buffer(spec: TrainingSpec, spaces: Spaces, rollout_length: int)
         fitting = most // column * rollout_length
         remedy = f"set training.replay_transitions={fitting} or fewer" if fitting else "use smaller observations"
         remedy += "" if spec.replay_megabytes is None else ", or raise training.replay_megabytes"
+        size, limit = mebibytes(columns * column, most)
         raise SettingsError(
-            f"a replay buffer of {capacity:,} transitions takes {columns * column / 2**20:,.0f} MiB, and {whose} "
-            f"{most / 2**20:,.0f} MiB: {fitting:,} transitions fit; {remedy}"
+            f"a replay buffer of {capacity:,} transitions takes {size} MiB, and {whose} {limit} MiB: "
+            f"{fitting:,} transitions fit; {remedy}"
         )
     return ReplayBuffer(spaces, rollout_length, capacity, device)
 

@@ -354,6 +354,8 @@ def test_a_buffer_that_does_not_fit_is_refused_with_what_would() -> None:
     assert str(refusal.value).endswith(" or fewer, or raise training.replay_megabytes")
     fitting = int(str(refusal.value).split("replay_transitions=")[1].split()[0])
     ReplayLearner(spec_of(replay_megabytes=4.0, replay_transitions=fitting), SPACES)
+    with pytest.raises(SettingsError, match=r"takes \d+\.\d+ MiB, and .* allows 0\.0\d+ MiB: 0 transitions fit"):
+        ReplayLearner(spec_of(replay_megabytes=0.0001, replay_transitions=20), SPACES)
     with pytest.raises(SettingsError, match="fit"):
         ReplayLearner(spec_of(replay_megabytes=4.0, replay_transitions=fitting + ROWS), SPACES)
 

@@ -7,7 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daedalus.protocol import keys
-from daedalus.protocol.texts import bounded_text, one_line, printable, short_number, short_share, without_secrets
+from daedalus.protocol.texts import (
+    bounded_text,
+    mebibytes,
+    one_line,
+    printable,
+    short_number,
+    short_share,
+    without_secrets,
+)
 
 offline = settings(max_examples=200, deadline=None, derandomize=True)
 
@@ -76,6 +84,20 @@ def test_numbers_of_any_size_have_three_digits_that_count(value: float, text: st
 )
 def test_a_share_is_all_or_nothing_only_if_it_is(share: float, text: str) -> None:
     assert short_share(share) == text
+
+
+@pytest.mark.parametrize(
+    ("sizes", "texts"),
+    [
+        ((3 << 30, 1 << 20), ["3,072", "1"]),
+        ((20_480, 10_485), ["0.02", "0.01"]),
+        ((1_048_577, 1_048_576), ["1.000001", "1.000000"]),
+        ((5 << 19, 0), ["2", "0"]),
+        ((1, 0), ["0.000001", "0.000000"]),
+    ],
+)
+def test_different_sizes_have_different_texts(sizes: tuple[int, ...], texts: list[str]) -> None:
+    assert mebibytes(*sizes) == texts
 
 
 @pytest.mark.parametrize(
