@@ -429,6 +429,8 @@ class Learner:
             optimizer.step(self._flat.values, self._flat.gradients, rate, (~norm.isfinite()).to(rate.dtype))
         if self._gradients.forward.target_parameters:
             self._gradients.forward.update_target()
+        if np.isnan(before):
+            return "there are too few steps to hold any out, so that it is not known how well the policy imitates them"
         return (
             f"mean log-probability of actions that were held out: {before:.3g} before, {cloning.held_out():.3g} after"
         )
