@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from minari.dataset.minari_storage import MinariStorage
 
 _METADATA_BYTES = 64 << 20  # the bounds of an image's pixels are listed one by one
-_EPISODE_BYTES = 1 << 30  # of one array of an episode
+EPISODE_BYTES = 1 << 30  # of one array of an episode
 _FREE_BYTES = 16 << 20  # of the disk, beside twice an episode, for it to be written
 _DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)) | {"bool"}
 _INSTALL = 'pip install "daedalus-rl[demonstrations]"'
@@ -262,8 +262,8 @@ class MinariReader:
             self._check_array(array, (rows, *array.shape[1:2]))
         elif array.is_virtual or array.external or array.shape != (rows,):
             raise self._error(f"{array.name} has the shape {array.shape}, not {(rows,)}, or is in another file")
-        if (size := rows * math.prod(space.shape or ())) > _EPISODE_BYTES:
-            raise self._error(f"{array.name} has {size:,} bytes of pixels: an episode may have {_EPISODE_BYTES:,}")
+        if (size := rows * math.prod(space.shape or ())) > EPISODE_BYTES:
+            raise self._error(f"{array.name} has {size:,} bytes of pixels: an episode may have {EPISODE_BYTES:,}")
 
     def _check_array(self, array: "h5py.Dataset", shape: tuple[int, ...]) -> None:
         if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
@@ -273,8 +273,8 @@ class MinariReader:
         if array.shape != shape:
             raise self._error(f"{array.name} has the shape {array.shape}, not {shape}")
         size = max(math.prod(shape), math.prod(array.chunks or ())) * array.dtype.itemsize
-        if size > _EPISODE_BYTES:
-            raise self._error(f"{array.name} has {size:,} bytes: an episode may have {_EPISODE_BYTES:,}")
+        if size > EPISODE_BYTES:
+            raise self._error(f"{array.name} has {size:,} bytes: an episode may have {EPISODE_BYTES:,}")
 
     def _metadata(self, path: Path) -> dict[str, Any]:
         try:
@@ -451,8 +451,8 @@ class MinariWriter:
             misfit = dtype_misfit(leaf.space, array)
             if array.shape[1:] != leaf.space.shape:
                 misfit = f"has the shape {array.shape[1:]}, not {leaf.space.shape}"
-            elif array.nbytes > _EPISODE_BYTES:
-                misfit = f"has {array.nbytes:,} bytes, of which an episode may have {_EPISODE_BYTES:,}"
+            elif array.nbytes > EPISODE_BYTES:
+                misfit = f"has {array.nbytes:,} bytes, of which an episode may have {EPISODE_BYTES:,}"
             if array.dtype == np.float16:  # has no number as large as the limit
                 array = array.astype(np.float32)
             if misfit := misfit or unfit_number(array):

@@ -1,6 +1,7 @@
 """Records the episodes of an environment into a dataset, whoever plays: a policy, a bot, a person at the keyboard."""
 
 import copy
+import logging
 import os
 import warnings
 from collections.abc import Iterator, Mapping
@@ -11,15 +12,18 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.bots import make_bot
-from daedalus.actor.environments.components import stacked
+from daedalus.actor.environments.components import leaves, stacked
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors, playing_error
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium
 from daedalus.actor.environments.info import MASK_KEY
-from daedalus.actor.environments.minari_files import Episode, MinariWriter
+from daedalus.actor.environments.minari_files import EPISODE_BYTES, Episode, MinariWriter
+from daedalus.actor.evaluation.episodes import LONGEST
 from daedalus.actor.evaluation.gamepad import INSTALL_PYGAME, Gamepad
 from daedalus.actor.evaluation.loaded_policy import Policy, another_player
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
+
+_logger = logging.getLogger(__name__)
 
 _RATE = 30  # steps a second, where the environment does not say
 
@@ -79,17 +83,31 @@ class BotPlayer:
 
 
 class Recorder(gymnasium.Wrapper):
-    """Writes each episode that ends into a dataset. An episode that is left before its end is not written."""
+    """Writes each episode that ends into a dataset. An episode that is left before its end is not written.
 
-    def __init__(self, environment: gymnasium.Env, writer: MinariWriter, *, episodes: int, seed: int) -> None:
-        """Record `episodes` episodes, the first one of the environment with this seed, the next with the next."""
+    An episode is in memory until its end. One that goes on for too long, or has a gigabyte, is truncated.
+    """
+
+    def __init__(
+        self, environment: gymnasium.Env, writer: MinariWriter, *, episodes: int, seed: int, longest: int = LONGEST
+    ) -> None:
+        """Record `episodes` episodes, the first one of the environment with this seed, the next with the next.
+
+        `longest`: truncate each episode after this many steps, or after the environment's own limit if that is larger.
+        """
         super().__init__(environment)
+        own_limit = environment.spec.max_episode_steps if environment.spec is not None else None
+        self._longest = max(longest, own_limit or 0)
+        spaces = (environment.observation_space, "observation"), (environment.action_space, "action")
+        self._parts = [leaves(*each) for each in spaces]
+        self._bytes = 0  # of the running episode
         self._writer, self._wanted, self._seed = writer, episodes, seed
         self._name = environment.spec.id if environment.spec is not None else type(environment.unwrapped).__name__
         self._observations: list[Any] = []
         self._actions: list[Any] = []
         self._rewards: list[float] = []
         self._gamepad: Gamepad | None = None  # chooses the actions in place of whoever steps
+        self._has_warned = False  # of an episode that is too long
         self._plays = False  # itself, and not a loop of the user's, which gets the environment's own exceptions
         self.returns: list[float] = []  # of the recorded episodes
 
@@ -105,6 +123,7 @@ class Recorder(gymnasium.Wrapper):
         with self._faults("reset"):
             observation, info = self.env.reset(seed=self.seed, options=options)
         self._observations, self._actions, self._rewards = [copy.deepcopy(observation)], [], []
+        self._bytes = 0
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -114,9 +133,10 @@ class Recorder(gymnasium.Wrapper):
         # Environments and players may use the same arrays again.
         self._actions.append(copy.deepcopy(action))
         with self._faults("step"):
-            result = observation, reward, terminated, truncated, _ = self.env.step(action)
+            observation, reward, terminated, truncated, info = self.env.step(action)
             self._observations.append(copy.deepcopy(observation))
             self._rewards.append(float(reward))
+            truncated = truncated or (not terminated and self._is_too_long(observation, action))
         if terminated or truncated:
             with self._faults("step"):  # such as observations of different shapes
                 observations = stacked(self.observation_space, self._observations)
@@ -129,7 +149,23 @@ class Recorder(gymnasium.Wrapper):
             )
             self._writer.add(episode, seed=self.seed)
             self.returns.append(sum(self._rewards))
-        return result
+        return observation, reward, terminated, truncated, info
+
+    def _is_too_long(self, observation: Any, action: Any) -> bool:
+        """Count a step, and return whether the episode has as much as is kept of one. Log a warning the first time."""
+        values = zip(self._parts, (observation, action), strict=True)
+        size = sum(leaf.of(value).nbytes for parts, value in values for leaf in parts)
+        self._bytes += size
+        if len(self._rewards) < self._longest and self._bytes + 2 * size <= EPISODE_BYTES:
+            return False
+        if not self._has_warned:
+            self._has_warned = True
+            _logger.warning(
+                "an episode has not ended after %s steps and is recorded as truncated there, as others will be: if the "
+                "environment never ends them, give it a time limit (gymnasium.register(max_episode_steps=...))",
+                f"{len(self._rewards):,}",
+            )
+        return True
 
     @contextmanager
     def _faults(self, call: str) -> Iterator[None]:

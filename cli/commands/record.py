@@ -194,15 +194,17 @@ def _record(
         recorded_environment,
         spec_to_record,
     )
+    from daedalus.actor.evaluation.episodes import LONGEST
     from daedalus.actor.evaluation.gamepad import Gamepad
     from daedalus.actor.evaluation.loaded_policy import load_policy
 
-    by_person, player = parsed.by in (_KEYS, _GAMEPAD), None
+    by_person, player, longest = parsed.by in (_KEYS, _GAMEPAD), None, LONGEST
     if parsed.directory is not None:
         policy = load_policy(parsed.directory, newest=parsed.newest, allow_modules=parsed.allow_module)
         spec, who = policy.spec.environment, f"the policy of {parsed.directory}, version {policy.policy_version}"
         modules = UserModules(frozenset(parsed.allow_module), str(parsed.directory))
         player = PolicyPlayer(policy, sampled=parsed.sampled)
+        longest = policy.spec.evaluation.max_episode_env_steps * spec.action_repeat
     else:
         spec, who = EnvironmentSpec(id=parsed.env), "a person" if by_person else parsed.by
         # The command line itself names them.
@@ -219,7 +221,7 @@ def _record(
             player = BotPlayer(parsed.by, environment.action_space, modules)
         spaces = environment.observation_space, environment.action_space
         writer = MinariWriter(parsed.out, *spaces, spec_to_record(environment), algorithm=who)
-        recorder = Recorder(environment, writer, episodes=parsed.episodes, seed=parsed.seed)
+        recorder = Recorder(environment, writer, episodes=parsed.episodes, seed=parsed.seed, longest=longest)
         stopped = False
         try:
             if player is None:

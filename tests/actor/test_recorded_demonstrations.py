@@ -12,6 +12,7 @@ import pytest
 from saved_runs import save
 
 from daedalus.actor.environments.minari_files import MinariWriter
+from daedalus.actor.evaluation import dataset_recorder
 from daedalus.actor.evaluation.dataset_recorder import Recorder
 from daedalus.cli.commands.export import export
 from daedalus.cli.commands.record import record
@@ -86,11 +87,14 @@ def test_a_random_player_obeys_a_mask_in_the_observation(recorded: Callable[...,
 
 
 class OneArray(gymnasium.Env):
-    """Counts its steps, in the same array each time."""
+    """Counts its steps, in the same array each time; its end may be given."""
 
     observation_space = gymnasium.spaces.Box(0.0, 9.0, (1,))
     action_space = gymnasium.spaces.Discrete(2)
     count = np.zeros(1, np.float32)
+
+    def __init__(self, end: float = 3.0) -> None:
+        self.end = end
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         self.count[:] = 0.0
@@ -98,7 +102,7 @@ class OneArray(gymnasium.Env):
 
     def step(self, action: Any) -> Any:
         self.count += 1.0
-        return self.count, 0.0, bool(self.count[0] == 3.0), False, {}
+        return self.count, 0.0, bool(self.count[0] == self.end), False, {}
 
 
 class Always:
@@ -115,6 +119,21 @@ def test_an_environment_may_use_its_array_again(tmp_path: Path) -> None:
     Recorder(environment, writer, episodes=1, seed=0).play(Always())
     (episode,) = minari.MinariDataset(tmp_path / "shown/data")
     assert episode.observations.ravel().tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(("longest", "most_bytes"), [(5, 1 << 30), (100, 72)])  # a step has 4 bytes and 8
+def test_an_episode_that_never_ends_is_truncated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, longest: int, most_bytes: int
+) -> None:
+    monkeypatch.setattr(dataset_recorder, "EPISODE_BYTES", most_bytes)
+    environment = OneArray(end=-1.0)
+    writer = MinariWriter(str(tmp_path / "shown"), environment.observation_space, environment.action_space)
+    Recorder(environment, writer, episodes=2, seed=0, longest=longest).play(Always())
+    for episode in minari.MinariDataset(tmp_path / "shown/data"):
+        assert episode.truncations.tolist() == [False] * 4 + [True]
+        assert not episode.terminations.any()
+    assert len(caplog.messages) == 1
+    assert "has not ended after 5 steps and is recorded as truncated" in caplog.text
 
 
 def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) -> None:
