@@ -21,7 +21,16 @@ from daedalus.launch.child_output import ChildOutput
 from daedalus.launch.environment_check import expected_defaults, expected_spaces
 from daedalus.launch.local_run import helper_log_words
 from daedalus.launch.logs import LogOptions, print_error
-from daedalus.launch.process_lifecycle import FAILED, NOT_REACHED, ORDERED, REACHED, STOPPED, SUPERSEDED, UNSAVED
+from daedalus.launch.process_lifecycle import (
+    BAD_USAGE,
+    FAILED,
+    NOT_REACHED,
+    ORDERED,
+    REACHED,
+    STOPPED,
+    SUPERSEDED,
+    UNSAVED,
+)
 from daedalus.launch.resumed_run import status_of
 from daedalus.launch.run_choice import NewRun, check_learner_installed, warn_of_unread, with_record
 from daedalus.launch.supervision import evaluators
@@ -43,8 +52,8 @@ from daedalus.learner.run.resuming import (
     fixed_changes,
     initial_to_resume,
 )
-from daedalus.learner.run.run_lock import RunLock
-from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.run.run_lock import RunInUseError, RunLock
+from daedalus.learner.run.settings import DeviceError, SettingsError
 from daedalus.learner.service import LearnerService, Outcome, Outputs
 from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.serving.run_context import RunContext
@@ -88,6 +97,8 @@ _FAILURES = (
     SettingsError,
     TransportError,
 )
+# The same command may succeed later.
+_PASSING = (CredentialsError, DamagedError, DeviceError, RunInUseError, TransportError)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,6 +242,7 @@ class LearnerProcess:
         training = self._run.spec.training
         self._progress = display(sys.stdout, training.env_steps, training.updates_per_batch)
         self._context = {"run": run_directory.run_name(self._run.directory)}  # fields of the log
+        self._actor_decides = False  # of which spaces the run is: another one may fit the settings
 
     def run(self) -> int:
         """Run the learner to its end and return the exit status."""
@@ -241,7 +253,7 @@ class LearnerProcess:
                 return self._serve(self._run, stack)
         except _FAILURES as error:
             print_error("learner", error)
-            return FAILED
+            return FAILED if self._actor_decides or isinstance(error, _PASSING) else BAD_USAGE
 
     def _serve(self, run: ChosenRun, stack: ExitStack) -> int:
         """Run the learner to its end and return the exit status; `stack` closes what is opened.
@@ -274,6 +286,7 @@ class LearnerProcess:
         if restored is None and options.prepared is None:
             run, spaces = self._with_spaces(run)
             self._progress.updates_per_batch = run.spec.training.updates_per_batch
+            self._actor_decides = spaces is None
         weights = options.new.init_from or (initial_to_resume(run.directory) if resumed else None)
         initial = find_policy(weights) if weights is not None and restored is None else None
         transport = options.network.open(run.spec, self._credentials, self._stop)

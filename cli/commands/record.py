@@ -122,8 +122,13 @@ def record(arguments: list[str]) -> int:
     if fault := _unfit_option(parsed):
         print_error("record", fault)
         return 2
-    from daedalus.actor.environments.minari_files import DatasetError
+    from daedalus.actor.environments.minari_files import DatasetError, new_dataset_folder
 
+    try:
+        new_dataset_folder(parsed.out)
+    except DatasetError as error:
+        print_error("record", error)
+        return 2
     try:
         with redirect_stdout(sys.stderr):  # the environment may print
             return _record(parsed, keys, idle, axes)

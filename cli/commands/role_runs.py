@@ -69,7 +69,7 @@ def train_roles(
             roles = _created(parsed, new, agents, started, stack)
         except _FAULTS as error:
             print_error("train", error)
-            return status_at_start(error) if isinstance(error, SettingsError) else 1
+            return _status(error)
         return _run(roles, parsed, screen, "daedalus train")
 
 
@@ -81,11 +81,15 @@ def resume_roles(parsed: argparse.Namespace, directories: Mapping[str, Path], sc
             roles = _resumed(parsed, directories, started, stack)
         except _FAULTS as error:
             print_error("resume", error)
-            return status_at_start(error) if isinstance(error, (SettingsError, UserModuleError)) else 1
+            return _status(error)
         if not roles.runs:
             say(f"nothing to do: the runs of {', '.join(roles.over)} are over")
             return NOT_REACHED if roles.missed else REACHED
         return _run(roles, parsed, screen, "daedalus resume")
+
+
+def _status(error: Exception) -> int:
+    return 1 if isinstance(error, EnvironmentProblemError | RunInUseError) else status_at_start(error)
 
 
 def _refuse_options(parsed: argparse.Namespace) -> None:

@@ -108,10 +108,10 @@ def sweep(arguments: list[str]) -> int:
         if error.name != "optuna":
             raise
         return _failed(INSTALL, 2)
+    except (EnvironmentProblemError, RunDataError, RunInUseError) as error:
+        return _failed(str(error), 1)
     except SettingsError as error:
         return _failed(str(error), 2)
-    except (EnvironmentProblemError, RunDataError) as error:
-        return _failed(str(error), 1)
     except OSError as error:
         return _failed(f"{error.filename or 'sweep'}: {error.strerror}", 1)
 
@@ -181,11 +181,11 @@ def _checked(choice: RunChoice) -> tuple[dict[str, Any] | None, int]:
 
 
 def _locked(folder: Path) -> RunLock:
-    """Return a lock on the folder. Raises SettingsError if another sweep has locked it."""
+    """Return a lock on the folder. Raises RunInUseError if another sweep has locked it."""
     try:
         return RunLock(folder)
     except RunInUseError:
-        raise SettingsError(f"{folder} is in use by another sweep: stop it first, or choose another --folder") from None
+        raise RunInUseError(f"{folder} is in use by another sweep: stop it first, or choose another --folder") from None
 
 
 def _record(folder: Path, parsed: argparse.Namespace) -> None:

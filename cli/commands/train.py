@@ -163,7 +163,7 @@ def resume(arguments: list[str]) -> int:
             run = resumed_run(choice, spec, lock, init_from, started=started, fork=True)
         except (EnvironmentProblemError, SettingsError) as error:
             print_error("resume", error)
-            return 1
+            return 1 if isinstance(error, EnvironmentProblemError) else status_at_start(error)
         if isinstance(run, FinishedRun):
             say(f"nothing to do: {run.reason}")
             return status_of(run)

@@ -43,7 +43,11 @@ class SettingsError(Exception):
     """Error for invalid settings. The message names the setting, the reason and the correction."""
 
 
-class DeviceLostError(SettingsError):
+class DeviceError(SettingsError):
+    """The device of the learner cannot be used now: it is missing, has too little memory or has failed."""
+
+
+class DeviceLostError(DeviceError):
     """The device of the learner does not answer any more: what it holds is lost."""
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
-from daedalus.learner.run.settings import DeviceLostError, SettingsError
+from daedalus.learner.run.settings import DeviceError, DeviceLostError, SettingsError
 from daedalus.policy.user_code import first_line
 
 _EARLIER_CALLS = 8  # with the shapes of a graph: they may be rare, and libraries of CUDA prepare at the first calls
@@ -23,9 +23,9 @@ Result = TypeVar("Result")
 
 
 def check_device(precision: str) -> None:
-    """Raise SettingsError if there is no CUDA device, or it cannot compute in the precision that the run asks for."""
+    """Raise DeviceError if there is no CUDA device, SettingsError if it cannot compute in the precision of the run."""
     if not torch.cuda.is_available():
-        raise SettingsError(
+        raise DeviceError(
             "training.device is cuda, but torch finds no CUDA device: install the NVIDIA driver and a CUDA build of "
             "torch, or set training.device=cpu"
         )
@@ -40,7 +40,7 @@ def check_device(precision: str) -> None:
 def memory_faults(
     rows: int, fitting: Callable[[], int], remedy: str = "training.batch_rollouts, or more training.minibatches,"
 ) -> Iterator[None]:
-    """Raise SettingsError if a GPU lacks memory in the block.
+    """Raise DeviceError if a GPU lacks memory in the block.
 
     Args:
       rows: of the batch.
@@ -57,7 +57,7 @@ def memory_faults(
             if fit
             else "nor do fewer: use smaller observations or a smaller network"
         )
-        raise SettingsError(
+        raise DeviceError(
             f"the updates of a batch of {rows:,} rows do not fit into the memory of the GPU; {advice}"
         ) from None
 

@@ -142,7 +142,7 @@ def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) 
     dataset = minari.MinariDataset(tmp_path / "shown/data")
     assert dataset.total_episodes == 2
     assert all((episode.actions == 1).all() for episode in dataset)  # nobody pressed a key
-    assert recorded("--env", "CartPole-v1", "--by", "keys", *keys) == 1  # the dataset is there
+    assert recorded("--env", "CartPole-v1", "--by", "keys", *keys) == 2  # the dataset is there
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_a_person_plays_with_keys(recorded: Callable[..., int], tmp_path: Path) 
         (("--env", "pumping:Unseen", "--by", "keys", "--key", "a=1"), 1, "render() must return an array"),
         (("--env", "CartPole-v1", "--by", "pumping:Nobody"), 1, "Nobody"),
         (("--env", "CartPole-v1", "--by", "Pump"), 2, "--by Pump is no player: write module:Bot, random, keys or "),
-        (("--env", "CartPole-v1", "--by", "random", "--out", "shown"), 1, "dataset shown has no id of Minari"),
+        (("--env", "CartPole-v1", "--by", "random", "--out", "shown"), 2, "dataset shown has no id of Minari"),
         (("--env", "pumping:Broken", "--by", "random"), 1, "Broken: step raises RuntimeError: the pole is gone"),
         (("--env", "pettingzoo.classic.connect_four_v3", "--by", "random"), 1, "datasets are of one agent"),
     ],

@@ -60,7 +60,7 @@ def test_two_sweeps_do_not_share_a_folder(capsys: pytest.CaptureFixture[str]) ->
     folder = Path("sweeps/cartpole-rollout_length")
     folder.mkdir(parents=True)
     with RunLock(folder):
-        assert sweep(["cartpole", *OVER]) == 2
+        assert sweep(["cartpole", *OVER]) == 1
     assert capsys.readouterr().err == (
         f"daedalus sweep: {folder} is in use by another sweep: stop it first, or choose another --folder\n"
     )

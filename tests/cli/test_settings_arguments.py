@@ -11,13 +11,18 @@ from daedalus.cli.commands.train import resume_parser, train_parser
 from daedalus.cli.settings_arguments import run_choice
 from daedalus.launch import learner_process
 from daedalus.launch.learner_process import ChosenRun, LearnerNetwork, LearnerProcess, choose_run
+from daedalus.launch.logs import LogOptions
+from daedalus.launch.process_lifecycle import BAD_USAGE, FAILED
 from daedalus.launch.role_training import shared_settings
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
-from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.run.run_lock import RunInUseError
+from daedalus.learner.run.settings import DeviceError, SettingsError
+from daedalus.policy.user_modules import NetworkError
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.interface import TransportError
 
 
 def spec_of(*words: str) -> RunSpec:
@@ -158,6 +163,31 @@ def test_a_learner_shows_the_lag_in_batches_of_the_settings_for_its_spaces(monke
     with ExitStack() as stack:
         process._serve(process._run, stack)
     assert (before, process._progress.updates_per_batch) == (10 * 16, 4 * 16)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (NetworkError("one_step_q, and continuous actions"), BAD_USAGE),
+        (SettingsError("rollouts of one row, and masks"), BAD_USAGE),
+        (DeviceError("no CUDA device"), FAILED),
+        (RunInUseError("the run is in use"), FAILED),
+        (TransportError("the address is in use"), FAILED),
+    ],
+)
+def test_a_learner_that_fails_again_each_time_ends_with_the_status_of_bad_usage(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, status: int
+) -> None:
+    def fail(*_: object) -> int:
+        raise error
+
+    options = learner_options(parser().parse_args(["cartpole"]), 0.0, Path())
+    process = LearnerProcess(options, threading.Event(), UserMetrics())
+    monkeypatch.setattr(LogOptions, "configure", lambda *_, **_others: None)
+    monkeypatch.setattr(process, "_serve", fail)
+    assert process.run() == status
+    process._actor_decides = True  # of which spaces the run is
+    assert process.run() == FAILED
 
 
 def test_settings_of_shared_actors_that_roles_have_different_are_named() -> None:
