@@ -51,11 +51,11 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
                 check_spaces(name, transforms.spaces, spaces)
             _warn(dataset, spec.environment)
             rows = rows_of_rollout(transforms.spaces)
-            columns = -(-(dataset.steps + dataset.episodes) // rows)
+            columns = -(-(dataset.rows(spec.environment.action_repeat) + dataset.episodes) // rows)
             check_memory(dataset.steps, columns * transforms.spaces.replay_bytes(rows))
             writer = DemonstrationsWriter(directory, name, transforms.spaces)
             try:
-                rollouts = demonstration_rollouts(dataset, transforms, spec.environment)
+                rollouts = _rollouts(dataset, transforms, spec)
                 newest = next(rollouts)
                 for following in rollouts:
                     writer.add(newest, last=False)
@@ -81,55 +81,76 @@ def _warn(dataset: MinariReader, environment: EnvironmentSpec) -> None:
             "ones with jpeg_encoding=False",
             dataset.name,
         )
-    if environment.action_repeat > 1:
-        _logger.warning(
-            "each step of dataset %s is taken as one of the run, whose actions are repeated %d times",
-            dataset.name,
-            environment.action_repeat,
-        )
 
 
-def demonstration_rollouts(
-    dataset: MinariReader, transforms: Transforms, environment: EnvironmentSpec
-) -> Iterator[Rollout]:
+def _rollouts(dataset: MinariReader, transforms: Transforms, spec: RunSpec) -> Iterator[Rollout]:
     """Yield the episodes as rollouts, as an actor would have sent them. Raises DatasetError."""
     rows = rows_of_rollout(transforms.spaces)
     row_bytes = max(transforms.spaces.replay_bytes(rows) // rows, 1)
     most = max(PART_BYTES // row_bytes // rows * rows, rows)  # rows of a part
-    pending = _Stream(transforms.spaces, rows)
+    pending, mixed, repeat = _Stream(transforms.spaces, rows), 0, spec.environment.action_repeat
     for number, episode in enumerate(dataset):
         try:
-            pending.add(_learnable(episode, transforms, environment))
+            part, differing = _learnable(episode, transforms, spec.environment)
+            if differing and spec.algorithm.replay:
+                raise ValueError(
+                    f"the run repeats each action {repeat} times (environment.action_repeat), and {differing:,} times "
+                    f"the actions of so many steps differ, which {spec.training.algorithm} cannot learn from: record "
+                    "the policy of a run that repeats as often, leave environment.action_repeat out, or choose appo"
+                )
+            pending.add(part)
+            mixed += differing
         except ValueError as error:
             raise DatasetError(f"dataset {dataset.name}: episode {number}: {error}") from None
         while pending.rows >= most:
             yield pending.taken(most)
+    if mixed:
+        _logger.warning(
+            "the run repeats each action %d times (environment.action_repeat), and in %s of %s rows of dataset %s the "
+            "actions of so many steps differ: the policy imitates the first one of each row",
+            repeat,
+            f"{mixed:,}",
+            f"{dataset.rows(repeat):,}",
+            dataset.name,
+        )
     if pending.rows:
         yield pending.taken(pending.rows)
 
 
-def _learnable(episode: Episode, transforms: Transforms, environment: EnvironmentSpec) -> dict[str, _Values]:
-    """Return the rows of an episode by kind: its L steps, and the reset row with its last observation. Raises
-    ValueError."""
-    steps = len(episode.rewards)
+def _learnable(
+    episode: Episode, transforms: Transforms, environment: EnvironmentSpec
+) -> tuple[dict[str, _Values], int]:
+    """Return the rows of an episode by kind, and in how many of them the actions differ.
+
+    A row has as many steps as the run repeats an action, with the first of their actions and the sum of their rewards.
+    The last row is the reset row, with the last observation. Raises ValueError.
+    """
+    length, repeat = len(episode.rewards), environment.action_repeat
+    starts = np.arange(0, length, repeat)
+    steps = len(starts)
     try:
-        frames = transforms.observe(episode.observations, None, np.zeros(steps + 1, np.bool_)).frames
+        frames = transforms.observe(episode.observations, None, np.zeros(length + 1, np.bool_)).frames
     except EnvironmentSetupError as error:
         raise ValueError(str(error)) from None
     for name, values in frames.items():
+        values = values if repeat == 1 else values[np.append(starts, length)]
         if unfit := unfit_number(values):
             raise ValueError(f"component {name!r} of an observation {unfit}")
         frames[name] = values.astype(transforms.spaces.observations[name].dtype, copy=False)
-    actions = transforms.policy_actions(episode.actions)
+    actions, differing = {}, np.zeros(steps, np.bool_)
+    for name, values in transforms.policy_actions(episode.actions).items():
+        actions[name] = values[starts]
+        changed = (values != np.repeat(actions[name], repeat, axis=0)[:length]).any(1)
+        differing |= np.logical_or.reduceat(changed, starts)
     ends = np.zeros((2, steps + 1), np.bool_)
     # A recording that breaks off is cut: the episode would have gone on. A termination at a limit is a termination.
     ends[:, steps - 1] = episode.terminated, not episode.terminated
-    rewards = np.append(episode.rewards, 0.0)
+    rewards = np.append(np.add.reduceat(episode.rewards, starts), 0.0)
     if np.abs(rewards).max() > LARGEST_REWARD:
         raise ValueError(f"a reward is beyond +-{LARGEST_REWARD:g}")
     rewards = rewards.astype(np.float32)
     make_learnable(environment, rewards, *ends)
-    return {
+    part = {
         "frames": frames,
         "actions": {name: np.concatenate([values, values[-1:]]) for name, values in actions.items()},
         "rows": {
@@ -140,6 +161,7 @@ def _learnable(episode: Episode, transforms: Transforms, environment: Environmen
             "ages": np.arange(steps + 1),  # rows since the beginning of the episode
         },
     }
+    return part, int(differing.sum())
 
 
 class _Stream:

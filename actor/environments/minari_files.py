@@ -151,6 +151,10 @@ class MinariReader:
         """Number of steps of all episodes."""
         return sum(self._lengths)
 
+    def rows(self, repeat: int) -> int:
+        """Return the number of rows of all episodes where each has the steps of one repeated action."""
+        return sum(-(-length // repeat) for length in self._lengths)
+
     @property
     def has_images_as_jpeg(self) -> bool:
         """Whether images of the observations lost detail when they were written."""

@@ -24,16 +24,16 @@ SPACES = Spaces(
 ROWS, ENVIRONMENTS = 20, 4
 
 
-def shown(seed: int, rows: int = ROWS) -> Rollout:
+def shown(seed: int) -> Rollout:
     """Return a rollout whose actions follow from the observations."""
-    frames = np.random.default_rng(seed).normal(5.0, 3.0, (rows + 1, ENVIRONMENTS, 3)).astype(np.float32)
+    frames = np.random.default_rng(seed).normal(5.0, 3.0, (ROWS + 1, ENVIRONMENTS, 3)).astype(np.float32)
     first, second = frames[:-1, :, 0], frames[:-1, :, 1]
     actions = {
         "turn": np.stack([np.where(first > 5.0, 3, 1), np.where(second > 5.0, 0, 2)], -1).astype(np.uint8),
         "push": np.where(first > 5.0, 0.5, -0.5)[..., None].astype(np.float32),
     }
     replaced: dict[str, Any] = {"frames": {"observation": frames}, "actions": actions}
-    return make_rollout(identity(sequence=seed), rows=rows, environments=ENVIRONMENTS, seed=seed, **replaced)
+    return make_rollout(identity(sequence=seed), rows=ROWS, environments=ENVIRONMENTS, seed=seed, **replaced)
 
 
 def learner_of(**training: Any) -> Learner:
@@ -62,13 +62,6 @@ def test_the_held_out_actions_may_be_more_than_a_minibatch() -> None:
     learner = learner_of(cloning_updates=1)
     learner.learn_from(demonstrations(rollouts=67))  # 419 are held out: two parts of unequal sizes
     assert "held out" in learner.clone()
-
-
-def test_too_few_steps_to_hold_any_out_are_reported() -> None:
-    learner, buffer = learner_of(cloning_updates=1), ReplayBuffer(SPACES, 2, 8)
-    buffer.add(shown(0, rows=2))
-    learner.learn_from(buffer)
-    assert "too few steps to hold any out" in learner.clone()
 
 
 def test_the_imitation_ends_when_the_run_is_stopped() -> None:

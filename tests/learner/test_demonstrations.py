@@ -450,4 +450,35 @@ def test_choices_with_masks_are_learned_from_without_them(tmp_path: Path) -> Non
     assert buffer is not None
     learner = Learner(spec.training.model_copy(update={"cloning_updates": 2}), spec.policy, masked)
     learner.learn_from(buffer)
-    assert "mean log-probability" in learner.clone()
+    assert "too few steps to hold any out" in learner.clone()
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "appo"])
+def test_steps_with_one_action_are_a_row_of_a_run_that_repeats_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, algorithm: str
+) -> None:
+    held = episode(0, 7, terminated=True)
+    held = held._replace(actions=np.repeat(held.actions[:3], 3, axis=0)[:7])
+    spec = spec_of(algorithm=algorithm)
+    spec = spec.model_copy(update={"environment": spec.environment.model_copy(update={"action_repeat": 3})})
+
+    def imported(name: str, *episodes: Episode) -> list[list[float]]:
+        writer = MinariWriter(str(tmp_path / name), OBSERVATIONS, ACTIONS)
+        for each in episodes:
+            writer.add(each)
+        write_demonstrations(str(tmp_path / name), spec, spaces_of(), tmp_path / f"run-{name}")
+        buffer = read_demonstrations(tmp_path / f"run-{name}", spec, spaces_of(), 0)
+        assert buffer is not None
+        found = buffer.transitions(buffer.learned_rows, 1, 0.9)
+        seen = (values["observation"][:, 1].tolist() for values in (found.observations, found.next_observations))
+        return [*seen, found.rewards.tolist(), found.discounts.tolist()]
+
+    rows = imported("held", held)
+    assert rows == [[0.0, 3.0, 6.0], [3.0, 6.0, 7.0], [1.5, 6.0, 3.0], [pytest.approx(0.9), pytest.approx(0.9), 0.0]]
+    assert "differ" not in caplog.text
+    if algorithm == "sac":
+        with pytest.raises(SettingsError, match=r"episode 1: the run repeats each action 3 times .* and 1 times the"):
+            imported("moved", held, episode(0, 4, terminated=True))
+    else:
+        assert imported("moved", held, episode(0, 4, terminated=True))[0] == [0.0, 3.0, 6.0, 0.0, 3.0]
+        assert "in 1 of 5 rows of dataset" in caplog.text
