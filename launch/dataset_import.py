@@ -11,6 +11,7 @@ from daedalus.actor.collecting.rollout_writer import make_learnable
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.minari_files import DatasetError, Episode, MinariReader
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.launch.environment_check import CheckTimeoutError, quick_check
 from daedalus.learner.run.demonstration_files import (
     PART_BYTES,
     DemonstrationsWriter,
@@ -19,8 +20,10 @@ from daedalus.learner.run.demonstration_files import (
     rows_of_rollout,
 )
 from daedalus.learner.run.settings import SettingsError
-from daedalus.protocol.spaces import LARGEST_REWARD, Spaces, unfit_number
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import LARGEST_REWARD, DiscreteSpace, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.texts import listed
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _logger = logging.getLogger(__name__)
@@ -49,6 +52,7 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
             transforms = Transforms(spec.environment, dataset.observation_space, dataset.action_space)
             if spaces is not None:
                 check_spaces(name, transforms.spaces, spaces)
+                _check_first_choices(name, transforms, spec)
             _warn(dataset, spec.environment)
             rows = rows_of_rollout(transforms.spaces)
             columns = -(-(dataset.rows(spec.environment.action_repeat) + dataset.episodes) // rows)
@@ -68,6 +72,28 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
         raise SettingsError(str(error)) from None
     except OSError as error:
         raise SettingsError(f"demonstrations cannot be written to {directory}: {error.strerror}") from None
+
+
+def _check_first_choices(name: str, transforms: Transforms, spec: RunSpec) -> None:
+    """Raise SettingsError if the choices of a dataset do not begin with those of the environment, which is made again.
+
+    A run counts all choices from 0, so that its spaces do not tell.
+    """
+    spaces = transforms.spaces
+    if not any(isinstance(each, DiscreteSpace) for each in (*spaces.observations.values(), *spaces.actions.values())):
+        return
+    try:
+        report = quick_check(spec.environment, UserModules.of(spec.user_modules), play=False)
+    except CheckTimeoutError:
+        return
+    there, here = transforms.first_choices, report.first_choices
+    for part in sorted({*there, *here} if report.spaces is not None else ()):
+        if there.get(part) != here.get(part):
+            first, own = (listed(choices.get(part, "0")) for choices in (there, here))
+            raise SettingsError(
+                f"dataset {name} (there) has other spaces than the run (here): the choices of {part} begin with "
+                f"{first} there, and with {own} here"
+            )
 
 
 def _warn(dataset: MinariReader, environment: EnvironmentSpec) -> None:

@@ -19,6 +19,7 @@ class EnvironmentReport(Specification):
     """Result of a check. It crosses a pipe as JSON."""
 
     spaces: Spaces | None = None  # as a run has them; None if the environment cannot be made or is not supported
+    first_choices: dict[str, tuple[int, ...]] = Field(default_factory=dict)  # of components that do not count from 0
     constant_texts: dict[str, str] = Field(default_factory=dict)  # components left out, and their content
     seats: int = 1  # agents of a game that the policy plays
     problems: tuple[str, ...] = ()  # training would fail

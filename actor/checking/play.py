@@ -373,6 +373,7 @@ class _Play:
         problems = [*self._problems, *([self._texts.problem] if self._texts.problem else [])]
         return EnvironmentReport(
             spaces=self._transforms.spaces,
+            first_choices=self._transforms.first_choices,
             constant_texts=self._texts.constant,
             problems=tuple(f"environment {self._name}: {problem}" for problem in problems),
             warnings=tuple(f"environment {self._name}: {warning}" for warning in warnings),

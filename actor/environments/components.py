@@ -354,6 +354,15 @@ class ActionComponents:
             leaf.name: BoundedActions(leaf.space) for leaf in self._leaves if isinstance(leaf.space, gym.Box)
         }
 
+    @property
+    def first_choices(self) -> dict[str, np.ndarray]:
+        """First choice of each variable of the components that are gymnasium's Discrete or MultiDiscrete."""
+        return {
+            leaf.name: np.ravel(leaf.space.start)
+            for leaf in self._leaves
+            if isinstance(leaf.space, gym.Discrete | gym.MultiDiscrete)
+        }
+
     def env_actions(self, values: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for values {name: [E, D]} of all components."""
         parts = {leaf.path: self._env_action(leaf, values[leaf.name]) for leaf in self._leaves}

@@ -205,6 +205,14 @@ class Transforms:
         """Whether `observe` needs an action mask: the actions have masks, and the observation does not contain them."""
         return bool(self.spaces.masks) and not self._observed_masks
 
+    @property
+    def first_choices(self) -> dict[str, tuple[int, ...]]:
+        """First choice of each variable of the components that do not count from 0 as the run does: by their names."""
+        starts = {f"observation {each.leaf.name}": each.first for each in self._observations if each.first is not None}
+        if isinstance(self._actions, ActionComponents):
+            starts |= {f"action {name}": first for name, first in self._actions.first_choices.items()}
+        return {name: tuple(first.tolist()) for name, first in starts.items() if first.any()}
+
     def observe(self, observations: Any, action_mask: Any, needed: np.ndarray) -> Observed:
         """Return batched observations of the environment as the run has them.
 

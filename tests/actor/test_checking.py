@@ -238,6 +238,12 @@ def test_without_play_only_the_spaces_are_read() -> None:
     assert (report.problems, report.env_steps) == ((), 0)
 
 
+def test_choices_that_do_not_count_from_0_are_reported() -> None:
+    modules = UserModules(frozenset({"nested_environment"}))
+    nested = check_environment(EnvironmentSpec(id="nested_environment:Nested-v0"), modules, seconds=0.0, env_steps=1)
+    assert nested.first_choices == {"observation sensors.code": (2,)}
+
+
 def test_a_module_that_is_not_allowed_is_not_imported() -> None:
     report = check_environment(EnvironmentSpec(id="os:Nothing-v0"), MODULES, seconds=1.0, env_steps=1)
     assert report.spaces is None

@@ -20,6 +20,7 @@ from minari.dataset.minari_storage import MinariStorage
 from mission_environment import MissionSpace
 from PIL import Image
 
+from daedalus.actor.checking.check_report import EnvironmentReport
 from daedalus.actor.environments.minari_files import DatasetError, Episode, MinariReader, MinariWriter
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.launch import dataset_import
@@ -438,13 +439,50 @@ def jpeg(size: tuple[int, int], mode: str = "RGB", form: str = "jpeg") -> bytes:
     return data.getvalue()
 
 
-def test_choices_with_masks_are_learned_from_without_them(tmp_path: Path) -> None:
+def report_of(spaces: Spaces, action_space: gymnasium.Space, spec: RunSpec) -> EnvironmentReport:
+    """Return what the check of an environment finds."""
+    first = Transforms(spec.environment, OBSERVATIONS, action_space).first_choices
+    return EnvironmentReport(spaces=spaces, first_choices=first)
+
+
+@pytest.mark.parametrize(
+    ("there", "here", "reason"),
+    [
+        (gymnasium.spaces.Discrete(3), gymnasium.spaces.Discrete(3, start=5), "begin with 0 there, and with 5 here"),
+        (gymnasium.spaces.Discrete(3, start=-1), gymnasium.spaces.Discrete(3), "begin with -1 there, and with 0 here"),
+        (
+            gymnasium.spaces.MultiDiscrete([3, 2], start=[1, 7]),
+            gymnasium.spaces.MultiDiscrete([3, 2], start=[1, 2]),
+            "begin with 1, 7 there, and with 1, 2 here",
+        ),
+        (gymnasium.spaces.Discrete(3), gymnasium.spaces.MultiDiscrete([3]), ""),  # with the same values
+    ],
+)
+def test_choices_that_begin_otherwise_than_those_of_the_environment_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: Any, here: gymnasium.Space, reason: str
+) -> None:
+    actions = np.zeros((5, *there.shape), np.int64) + there.start
+    MinariWriter(str(tmp_path / "shown"), OBSERVATIONS, there).add(
+        episode(0, 5, terminated=True)._replace(actions=actions)
+    )
+    spec = RunSpec.model_validate({"environment": {"id": "Arm-v0"}, "training": {"algorithm": "appo"}})
+    spaces = Transforms(spec.environment, OBSERVATIONS, here).spaces
+    monkeypatch.setattr(dataset_import, "quick_check", lambda *_, play: report_of(spaces, here, spec))
+    if reason:
+        with pytest.raises(SettingsError, match=f"has other spaces than the run .*: the choices of action .* {reason}"):
+            write_demonstrations(str(tmp_path / "shown"), spec, spaces, tmp_path)
+    else:
+        write_demonstrations(str(tmp_path / "shown"), spec, spaces, tmp_path)
+
+
+def test_choices_with_masks_are_learned_from_without_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A dataset has no masks of the environment's info: what was played was legal."""
     space = gymnasium.spaces.Discrete(3)
     writer = MinariWriter(str(tmp_path / "shown"), OBSERVATIONS, space)
     writer.add(episode(0, 5, terminated=True)._replace(actions=np.array([0, 2, 1, 1, 0])))
     masked = Spaces(observations=spaces_of().observations, actions={"action": DiscreteSpace(counts=(3,), masked=True)})
     spec = RunSpec.model_validate({"environment": {"id": "Arm-v0"}, "training": {"algorithm": "appo"}})
+    monkeypatch.setattr(dataset_import, "quick_check", lambda *_, play: report_of(masked, space, spec))
     write_demonstrations(str(tmp_path / "shown"), spec, masked, tmp_path)
     buffer = read_demonstrations(tmp_path, spec, masked, 0)
     assert buffer is not None
