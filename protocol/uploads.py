@@ -6,6 +6,7 @@ Time first: row t holds observation t, the action chosen from it and the reward 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -230,6 +231,13 @@ class Gradient:
 
 
 Upload = Rollout | Gradient
+
+
+def mean_return(returns: Sequence[float] | np.ndarray) -> float:
+    """Return the mean of at least one return in float64: of equal ones exactly theirs, which a target may be."""
+    values = np.asarray(returns, np.float64)
+    rounded = values.mean()
+    return float(rounded + (values - rounded).mean())
 
 
 def _check_episodes(upload: Upload) -> None:

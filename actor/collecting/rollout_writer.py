@@ -268,7 +268,7 @@ class RolloutWriter:
             # A state that is not finite begins anew, too, for it would stay so. The learner refuses this rollout.
             goes_on = valid & np.isfinite(self._next_state).all(axis=1)
             self._state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
-        self._episodes.step(self._rewards[row], valid, self._terminated[row] | self._truncated[row])
+        self._episodes.step(rewards, valid, self._terminated[row] | self._truncated[row])
         self._row += 1
         return self._row == len(self._rewards)
 
@@ -471,7 +471,6 @@ class SeatWriter(RolloutWriter):
             state = np.where(goes_on[:, None], self._next_state, np.float32(0.0))
             self._state = np.where(observed.acting[:, None], state, self._state)
         self._show(observed)
-        rewards = rewards.astype(np.float32)
         counted = self._lineup.column >= 0
         abandoned = self._lineup.step(rewards, (observed.over & ~was_over).nonzero()[0].tolist())
         # Also those that are not written: the agents who act most often would have too few results in the mean.

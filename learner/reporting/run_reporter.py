@@ -27,7 +27,7 @@ from daedalus.policy.saving.best_checkpoints import set_aside_newer
 from daedalus.protocol.league import LeagueStatus
 from daedalus.protocol.messages import RunStatus
 from daedalus.protocol.releases import own_release
-from daedalus.protocol.uploads import Upload
+from daedalus.protocol.uploads import Upload, mean_return
 from daedalus.transport.process_usage import UsageMeter
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def episode_statistics(counters: RunCounters) -> dict[str, float]:
         return {}
     returns = np.array(counters.returns)
     return {
-        "episode_return_mean": float(returns.mean()),
+        "episode_return_mean": mean_return(returns),
         "episode_return_std": float(returns.std()),
         "episode_return_min": float(returns.min()),
         "episode_return_max": float(returns.max()),

@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
 from daedalus.learner.league.ratings import LeagueState
 from daedalus.learner.run.lesson_progress import LessonState
 from daedalus.protocol.spec import RunSpec, TrainingSpec
-from daedalus.protocol.uploads import MAX_INFO_NAMES, Rollout, Upload
+from daedalus.protocol.uploads import MAX_INFO_NAMES, Rollout, Upload, mean_return
 
 
 class Annealing(BaseModel, frozen=True, strict=True, extra="forbid"):
@@ -165,7 +164,7 @@ class RunCounters:
     @property
     def episode_return_mean(self) -> float | None:
         """Mean return of the newest `target_episodes` training episodes; None before the first episode."""
-        return float(np.mean(self.returns)) if self.returns else None
+        return mean_return(self.returns) if self.returns else None
 
     @property
     def policy_lag_mean(self) -> float:

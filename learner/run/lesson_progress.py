@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from daedalus.protocol.lessons import MAX_RANGES, LessonPlan, LessonRange, LessonSpec, as_true
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import bounded_text, exact_number, short_number
-from daedalus.protocol.uploads import Upload
+from daedalus.protocol.uploads import Upload, mean_return
 
 _PARTS = 8  # of a range whose parts are compared, at most
 # A part's mean return over about 20 episodes is compared with that over about 100. As in Matiisen et al. (2017),
@@ -120,7 +120,7 @@ class _Lesson:
             return
         # The highest and the lowest twentieth count as much as the next: one false return must not end a step.
         aside, ordered = len(state.returns) // 20, np.sort(state.returns)
-        mean = float(ordered.clip(ordered[aside], ordered[-1 - aside]).mean())
+        mean = mean_return(ordered.clip(ordered[aside], ordered[-1 - aside]))
         if mean < above:
             return
         while state.step < len(steps) and self.value(0) == value:  # equal values in a row are one step

@@ -15,7 +15,7 @@ from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 from daedalus.protocol.texts import short_number
-from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER
+from daedalus.protocol.uploads import LARGEST_EPISODE_NUMBER, mean_return
 
 _MAX_IN_PROGRESS = 16
 
@@ -86,14 +86,14 @@ class Evaluations:
         if (report.lengths < 1).any():
             return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), None
         del self.in_progress[report.evaluator]
-        mean = float(report.returns.mean(dtype=np.float64))
+        mean = mean_return(report.returns)
         self.counters.evaluated(mean)
         text = f"evaluation at {env_steps:,} env_steps: {self.note(report, env_steps)}"
         return Acknowledgement(verdict="accepted"), Evaluated(directory, version, mean, text)
 
     def note(self, report: EvaluationReport, env_steps: int) -> str:
         """Let a report be the newest evaluation in the metrics, and return its result in words."""
-        mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
+        mean, std = mean_return(report.returns), float(report.returns.std(dtype=np.float64))
         self.newest = {
             "evaluation_return_mean": mean,
             "evaluation_return_std": std,

@@ -15,6 +15,7 @@ import numpy as np
 
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, link_sealed, remove_sealed
 from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.uploads import mean_return
 
 _BEST = re.compile(r"best_(training_)?(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)_(\d{10,})", re.ASCII)
 _NAMED_AGENTS = 6  # of a game, for a person
@@ -184,7 +185,7 @@ def evaluation_result(
         "policy_version": policy_version,
         "episodes": len(returns),
         "notes": notes,
-        "return_mean": float(returns.mean()),
+        "return_mean": mean_return(returns),
         "return_std": float(returns.std()),
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
