@@ -103,7 +103,7 @@ class Masks:
     def _by_component(self, action_mask: Any) -> dict[str, np.ndarray]:
         """Return masks {name: [E, choices]} bool from a map by component, or one array over all their choices."""
         if isinstance(action_mask, dict):
-            parts = {str(name): _array(mask) for name, mask in action_mask.items() if str(name)[:1] != "_"}
+            parts = {name: _array(mask) for name, mask in masks_by_component(action_mask).items()}
         elif len(self._spaces) == 1:
             parts = {next(iter(self._spaces)): _array(action_mask)}
         else:
@@ -218,20 +218,32 @@ def _joined(mask: Any) -> np.ndarray:
     return np.asarray(mask).ravel()
 
 
+def masks_by_component(action_mask: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return the masks of a batch by component, without gymnasium's flags `_NAME` [E] beside each mask `NAME`.
+
+    The name of a component may begin with `_`, too: any character that a name cannot have becomes one.
+    """
+    return {
+        str(name): mask
+        for name, mask in action_mask.items()
+        if not (str(name)[:1] == "_" and str(name)[1:] in action_mask and np.ndim(mask) == 1)
+    }
+
+
 def _holds_mask(action_mask: Any) -> bool:
     """Return whether a batch of masks has any. gymnasium batches None of all environments as objects."""
     if isinstance(action_mask, dict):
-        return any(_holds_mask(mask) for name, mask in action_mask.items() if str(name)[:1] != "_")
+        return any(_holds_mask(mask) for mask in masks_by_component(action_mask).values())
     if isinstance(action_mask, np.ndarray) and action_mask.dtype == np.object_:
         return any(mask is not None for mask in action_mask.flat)
     return action_mask is not None
 
 
-def only_of_masks(action_mask: Any) -> Any:
-    """Return the only mask, or map of masks, of a batch of one."""
+def only_of_masks(action_mask: Any, row: int = 0) -> Any:
+    """Return one mask, or map of masks, of a batch, of one by default."""
     if isinstance(action_mask, dict):
-        return {name: mask[0] for name, mask in action_mask.items()}
-    return action_mask[0]
+        return {name: mask[row] for name, mask in masks_by_component(action_mask).items()}
+    return action_mask[row]
 
 
 def mask_of_one(action_mask: Any) -> Any:

@@ -13,6 +13,7 @@ from gymnasium import spaces as gym
 from daedalus.actor.environments.components import continuous_space, leaves, nested, only_of_batch, stacked
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.games import GameEnvironments
+from daedalus.actor.environments.info import only_of_masks
 from daedalus.actor.evaluation.loaded_policy import Policy, another_player, environments_of
 from daedalus.policy.saving.onnx_graph import NOISE, noise_of
 
@@ -198,6 +199,4 @@ def _steps(
 
 
 def _mask_of(mask: Any, row: int) -> Any:
-    if isinstance(mask, dict):
-        return {name: values[row] for name, values in mask.items() if not name.startswith("_")}
-    return None if mask is None else mask[row]
+    return None if mask is None else only_of_masks(mask, row)

@@ -241,13 +241,17 @@ def test_the_check_reports_masks_that_come_only_with_steps(convention: str) -> N
     )
 
 
-def test_masks_of_several_components_are_a_map() -> None:
-    action = gym.Dict({"a": gym.Discrete(2), "b": gym.MultiDiscrete([2, 3]), "c": gym.Box(-1, 1)})
-    example = {"b": np.ones((1, 5), np.int8)}
+@pytest.mark.parametrize(("key", "name"), [("b", "b"), ("_b", "_b"), ("左", "_"), ("_a", "_a")])
+def test_masks_of_several_components_are_a_map(key: str, name: str) -> None:
+    """A vector environment has gymnasium's flags beside the masks; a map of `a` and `_a` comes from an observation."""
+    action = gym.Dict({"a": gym.Discrete(2), key: gym.MultiDiscrete([2, 3]), "c": gym.Box(-1, 1)})
+    example = {name: np.ones((1, 5), np.int8)}
+    example |= {"a": np.ones((1, 2), np.int8)} if name == "_a" else {f"_{name}": np.ones(1, np.bool_)}
     transforms = Transforms(SPEC, gym.Box(0, 1), action, example)
-    assert transforms.spaces.masks == {"b": 5}
-    observed = transforms.observe_one(np.zeros(1), {"b": np.array([0, 1, 1, 0, 0])})
-    assert observed.masks["b"].tolist() == [[False, True, True, False, False]]
+    assert transforms.spaces.masks == {each: len(mask[0]) for each, mask in example.items() if mask.ndim == 2}
+    mask = {name: np.array([0, 1, 1, 0, 0])} | ({"a": np.ones(2)} if name == "_a" else {})
+    observed = transforms.observe_one(np.zeros(1), mask)
+    assert observed.masks[name].tolist() == [[False, True, True, False, False]]
 
 
 MASKED = {"a": gym.Discrete(2), "arm": gym.Dict(grip=gym.MultiDiscrete([2, 3])), "c": gym.Box(-1, 1)}
