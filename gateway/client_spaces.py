@@ -68,6 +68,11 @@ class ClientSpaces:
                 raise ClientError("misfit", f"{name}.masked is for actions")
         self.observation_space = _nested_space(self._observations, bare="observation")
         self.action_space = _nested_space(self._actions, bare="action")
+        self._limits = {
+            name: _stated_limits(actions[name])
+            for name, space in self._actions.items()
+            if isinstance(space, ContinuousSpace)
+        }
         self._masks = self.stated.masks
         self.example_mask = {name: np.ones(size, np.bool_) for name, size in self._masks.items()} or None
 
@@ -115,8 +120,13 @@ class ClientSpaces:
     def action(self, value: Any) -> Any:
         """Return gymnasium's action as numbers, lists and maps by component."""
         if self._actions.keys() == {"action"}:
-            return _plain(value, self._actions["action"])
-        return {name: _plain(_found(value, name), space) for name, space in self._actions.items()}
+            return self._plain("action", value)
+        return {name: self._plain(name, _found(value, name)) for name in self._actions}
+
+    def _plain(self, name: str, value: Any) -> Any:
+        if name in self._limits:  # float32, in which a bound such as 0.1 is another number
+            return np.asarray(value, np.float64).reshape(-1).clip(*self._limits[name]).tolist()
+        return int(value) if self._actions[name].size == 1 else np.asarray(value).reshape(-1).tolist()
 
 
 def _first_fault(fault: ValidationError | RecursionError) -> str:
@@ -169,6 +179,13 @@ def _nested(components: Mapping[str, Any]) -> dict[str, Any]:
             raise ClientError("misfit", f"the component {name!r} has the name of others")
         inner[last] = value
     return nested
+
+
+def _stated_limits(space: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest numbers [D] of a continuous component as the client has them, in float64."""
+    low = [-np.inf if bound is None else float(bound) for bound in space["low"]]
+    high = [np.inf if bound is None else float(bound) for bound in space["high"]]
+    return np.array(low), np.array(high)
 
 
 def _found(value: Any, name: str) -> Any:
@@ -289,12 +306,6 @@ def _mask(value: Any, space: _Component, name: str) -> np.ndarray:
             raise ClientError("misfit", f"the action_mask of {name} forbids every choice of a variable")
         first += count
     return np.array(value) != 0
-
-
-def _plain(value: Any, space: DiscreteSpace | ContinuousSpace) -> Any:
-    if isinstance(space, DiscreteSpace) and space.size == 1:
-        return int(value)
-    return np.asarray(value).reshape(-1).tolist()
 
 
 MAX_IMAGE_BYTES = 8 << 20  # 1920 x 1080 pixels in RGB fit

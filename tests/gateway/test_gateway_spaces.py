@@ -294,6 +294,14 @@ def test_override_is_an_action_that_can_be_learned_from(action: Any, value: Any,
     assert played["action"] == np.array([[learned]], np.float32)
 
 
+def test_actions_are_within_the_bounds_that_the_client_states() -> None:
+    """0.7 is lower in float32, and 1.1 higher."""
+    stated = {"kind": "continuous", "low": [0.7, None], "high": [1.1, None]}
+    spaces = ClientSpaces({"observation": PLAIN}, {"action": stated})
+    assert spaces.action(np.array([0.7, 5.0], np.float32)) == [0.7, 5.0]
+    assert spaces.action(np.array([1.1, -5.0], np.float32)) == [1.1, -5.0]
+
+
 @pytest.mark.parametrize(
     ("action", "value", "text"),
     [
