@@ -169,7 +169,9 @@ class ClientRows:
             self._discard()
         self._overridden, self._played = override is not None, self._to_learn_from(override)
         # No rollout begins with a row that nobody learns from: in each there is one to learn from.
-        self._idle = idle or (self._overridden and self._played is None and self.is_between_rollouts)
+        unlearned = self._overridden and self._played is None
+        only_resets = self._episode_ended and self._spec.collection.rollout_length == 1
+        self._idle = idle or (self.is_between_rollouts and (unlearned or only_resets))
 
     def _to_learn_from(self, override: Any) -> dict[str, np.ndarray] | None:
         """Return the action that is played as the policy would have chosen it; None if it could not, or nobody learns

@@ -220,6 +220,23 @@ def test_rows_between_the_rollouts_of_a_synchronous_run_are_not_written() -> Non
         assert episode_violation(rollout) == ""
 
 
+def test_a_rollout_of_one_row_is_no_reset_row() -> None:
+    """A synchronous run of episodes of one step would else wait for their reset rows, and learn from no others."""
+    spec = run_spec()
+    spec = spec.model_copy(update={"collection": spec.collection.model_copy(update={"rollout_length": 1})})
+    played = synchronous(Played(spec))
+    client, robot = begun(played)
+    robot.environment = gymnasium.make(spec.environment.id, ends=(1,)).unwrapped
+    robot.environment.reset(seed=1)
+    for version in range(1, 5):
+        assert client.collect(IDENTITY) is None  # the service asks for a rollout
+        drive(client, robot, 2)
+        rollout = take(client)
+        assert rollout.valid.all()
+        assert rollout.episode_lengths.tolist() == [1]
+        client.load(played.snapshot(version))
+
+
 def observations(count: int) -> np.ndarray:
     shape = gymnasium.make(run_spec().environment.id).observation_space.shape
     assert shape is not None
