@@ -100,8 +100,8 @@ def _tracker_name(name: str) -> str:
 
 
 def run_choice(arguments: argparse.Namespace) -> RunChoice:
-    """Return what the options of `add_settings` choose."""
-    return RunChoice(
+    """Return what the options of `add_settings` choose. Raises SettingsError for two values of one setting."""
+    choice = RunChoice(
         preset=arguments.preset,
         env=arguments.env,
         algorithm=arguments.algorithm,
@@ -111,6 +111,8 @@ def run_choice(arguments: argparse.Namespace) -> RunChoice:
         wrap=arguments.wrap,
         assignments=tuple(arguments.set),
     )
+    choice.refuse_two_values()
+    return choice
 
 
 def new_run(arguments: argparse.Namespace) -> NewRun:

@@ -53,6 +53,7 @@ class ResumeChoice:
                 f"the environment of this run, {spec.environment.id}, is an object of the Python program that started "
                 f"it, and no module has it: continue in Python, with daedalus.resume({str(self.directory)!r}, env=...)"
             )
+        RunChoice(env_steps=self.env_steps, assignments=self.assignments, settings=self.settings).refuse_two_values()
         settings = dict(self.settings)
         if self.env_steps is not None:
             settings["training.env_steps"] = self.env_steps

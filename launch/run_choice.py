@@ -124,21 +124,35 @@ class RunChoice:
                 self.preset,
                 ", ".join(replaced),
             )
-        shortcuts = {
-            ("training", "seed"): self.seed,
-            ("training", "env_steps"): self.env_steps,
-            ("collection", "actors"): self.actors,
-            ("environment", "wrap"): self.wrap,
-        }
-        for (section, key), value in shortcuts.items():
-            if value is not None:
-                settings.setdefault(section, {})[key] = value
+        for path, value in self._options().items():
+            assign(settings, path, value)
         self._change(settings)
         if self.env is not None and (chosen := settings["environment"].get("id")) != self.env:
             raise SettingsError(
                 f"--env {self.env} and environment.id={chosen} are two environments: leave one of them out"
             )
         return settings
+
+    def _options(self) -> dict[str, Any]:
+        """Return the settings that have an option of their own, where it was given, by SECTION.KEY."""
+        options = {
+            "training.seed": self.seed,
+            "training.env_steps": self.env_steps,
+            "collection.actors": self.actors,
+            "environment.wrap": self.wrap,
+        }
+        return {path: value for path, value in options.items() if value is not None}
+
+    def refuse_two_values(self) -> None:
+        """Raise SettingsError if an option and a further setting give one setting two values."""
+        changed: dict[str, Any] = {}
+        self._change(changed)
+        for path, value in {**self._options(), "training.algorithm": self.algorithm}.items():
+            section, key = path.split(".")
+            other = changed.get(section, {}).get(key, value)
+            if value is not None and other != value:
+                option = "--" + key.replace("_", "-")
+                raise SettingsError(f"{option} {value} and {path}={other} are two values: leave one of them out")
 
     def _change(self, settings: dict[str, Any]) -> None:
         """Apply the further settings, in place."""

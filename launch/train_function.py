@@ -130,6 +130,7 @@ def train(
         is_instance=given.is_instance,
         settings=settings or {},
     )
+    choice.refuse_two_values()
     new = NewRun(
         choice=choice,
         directory=None if run_dir is None else Path(run_dir),

@@ -44,6 +44,24 @@ def test_two_environments_are_refused() -> None:
     assert spec.environment.id == "CartPole-v1"
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "other", "setting"),
+    [
+        ("--env-steps", "100000", "200000", "training.env_steps"),
+        ("--seed", "1", "2", "training.seed"),
+        ("--actors", "1", "2", "collection.actors"),
+        ("--algorithm", "a2c", "appo", "training.algorithm"),
+        ("--wrap", "a:b", "a:c", "environment.wrap"),
+    ],
+)
+def test_two_values_of_one_setting_are_refused(option: str, value: str, other: str, setting: str) -> None:
+    words = ["--env", "CartPole-v1", option, value, "--set"]
+    with pytest.raises(SettingsError, match=rf"{option} {value} and {setting}={other} are two values: leave one"):
+        spec_of(*words, f"{setting}={other}")
+    section, key = setting.split(".")
+    assert str(getattr(getattr(spec_of(*words, f"{setting}={value}"), section), key)) == value
+
+
 def test_a_preset_and_an_environment_are_refused() -> None:
     with pytest.raises(SettingsError, match=r"^leave out one of cartpole and --env CartPole-v1$"):
         spec_of("cartpole", "--env", "CartPole-v1")
