@@ -57,7 +57,21 @@ def test_the_grid_encoder_convolves_planes() -> None:
     np.testing.assert_allclose(features.detach().numpy(), expected.reshape(2, -1), atol=1e-5)
 
 
-@pytest.mark.parametrize("policy", [{}, {"encoder": "grid"}, {"activation": "relu"}, {"memory": "gru"}])
+def test_codes_are_normalised_as_one_hot_numbers() -> None:
+    network = ActorCritic(PolicySpec(codes={NAME: COUNTS}, normalize_observations=True), plain_spaces(GRID, 2))
+    seen = cells(np.random.default_rng(4), 3, 5, 6)
+    planes = one_hot(seen, COUNTS)
+    shares, variance = planes.mean(0), np.linspace(0.001, 0.25, planes[0].size).reshape(planes[0].shape)
+    network.normalizer.set_statistics(NAME, torch.from_numpy(shares), torch.from_numpy(variance))
+    expected = ((planes - shares) / np.sqrt(variance)).clip(-10.0, 10.0)
+    prepared = network.prepare({NAME: torch.from_numpy(seen)})[NAME].numpy()
+    np.testing.assert_allclose(prepared, expected, rtol=2**-7, atol=1e-5)  # of bfloat16
+    assert np.abs(prepared).max() == 10.0
+
+
+@pytest.mark.parametrize(
+    "policy", [{}, {"encoder": "grid"}, {"activation": "relu"}, {"memory": "gru"}, {"normalize_observations": True}]
+)
 def test_a_policy_has_no_probability_for_what_is_no_code(policy: dict[str, Any]) -> None:
     """In the program, too, which an actor, an evaluation, or nobody of ours may run. Other rows are not spoilt."""
     spaces = plain_spaces(GRID, 4)
