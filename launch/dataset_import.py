@@ -85,6 +85,7 @@ def _check_first_choices(name: str, transforms: Transforms, spec: RunSpec) -> No
     try:
         report = quick_check(spec.environment, UserModules.of(spec.user_modules), play=False)
     except CheckTimeoutError:
+        _logger.warning("the environment was not made in time: whether its choices begin as those of %s is open", name)
         return
     there, here = transforms.first_choices, report.first_choices
     for part in sorted({*there, *here} if report.spaces is not None else ()):

@@ -149,8 +149,8 @@ class RunChoice:
         self._change(changed)
         for path, value in {**self._options(), "training.algorithm": self.algorithm}.items():
             section, key = path.split(".")
-            other = changed.get(section, {}).get(key, value)
-            if value is not None and other != value:
+            other = changed.get(section, {}).get(key, "none")  # an unset one is not there
+            if value is not None and path in self.assigned and other != value:
                 option = "--" + key.replace("_", "-")
                 raise SettingsError(f"{option} {value} and {path}={other} are two values: leave one of them out")
 

@@ -52,6 +52,7 @@ def test_two_environments_are_refused() -> None:
         ("--actors", "1", "2", "collection.actors"),
         ("--algorithm", "a2c", "appo", "training.algorithm"),
         ("--wrap", "a:b", "a:c", "environment.wrap"),
+        ("--wrap", "a:b", "none", "environment.wrap"),
     ],
 )
 def test_two_values_of_one_setting_are_refused(option: str, value: str, other: str, setting: str) -> None:
@@ -202,6 +203,7 @@ def test_a_learner_that_fails_again_each_time_ends_with_the_status_of_bad_usage(
     options = learner_options(parser().parse_args(["cartpole"]), 0.0, Path())
     process = LearnerProcess(options, threading.Event(), UserMetrics())
     monkeypatch.setattr(LogOptions, "configure", lambda *_, **_others: None)
+    # Each fault would need a run, a network and an actor of its own; only what becomes of it is tested here.
     monkeypatch.setattr(process, "_serve", fail)
     assert process.run() == status
     process._actor_decides = True  # of which spaces the run is
