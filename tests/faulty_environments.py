@@ -92,7 +92,8 @@ class Faulty(gymnasium.Env[Any, Any]):
         reward = -1e12 if self._fault == "large reward" else reward
         reward = [1.0] if self._fault == "reward in a list" and self._step == 3 else reward
         info: Any = _odd_info(self._step) if self._fault == "info" else {}
-        result = self._observe(), reward, int(over) if self._fault == "flag" else over, False, info
+        flag: Any = {"flag": int(over), "flag as text": str(over)}.get(self._fault, over)
+        result = self._observe(), reward, flag, False, info
         return result[:4] if self._fault == "values" else result
 
     def close(self) -> None:

@@ -112,9 +112,8 @@ def step_violations(space: gymnasium.Space, result: Any) -> Iterator[Violation]:
     observation, reward, terminated, truncated, info = result
     yield from observation_violations(space, observation, "step")
     yield from reward_violations(reward)
-    for name, flag in (("terminated", terminated), ("truncated", truncated)):
-        if not isinstance(flag, bool | np.bool_):
-            yield "warning", f"step returns {name}={_shown(flag)}, of type {type(flag).__name__}: it must be a bool"
+    yield from flag_violations("terminated", terminated)
+    yield from flag_violations("truncated", truncated)
     if not isinstance(info, dict):
         yield "problem", f"step returns info of type {type(info).__name__}: it must be a dict"
 
@@ -130,6 +129,24 @@ def reward_violations(reward: Any) -> Iterator[Violation]:
         number = math.inf
     if not math.isfinite(number):
         yield "problem", f"step returns the reward {number}: it must be finite"
+
+
+def flag_violations(name: str, flag: Any) -> Iterator[Violation]:
+    """Yield what is wrong with `terminated` or `truncated`. A text such as "False" is true for Python: a problem."""
+    if not isinstance(flag, bool | np.bool_):
+        text = f"step returns {name}={_shown(flag)}, of type {type(flag).__name__}: it must be a bool"
+        yield "warning" if flag is None or all_flags(flag, 1) else "problem", text
+
+
+def all_flags(values: Any, count: int) -> bool:
+    """Return whether values are `count` bools, or numbers that are 0 or 1."""
+    try:
+        array = np.asarray(values)
+    except ValueError:  # lists of different lengths
+        return False
+    return array.size == count and (
+        array.dtype == np.bool_ or (array.dtype.kind in "iuf" and set(array.flat) <= {0, 1})
+    )
 
 
 def learned_reward_violations(reward: float, spec: EnvironmentSpec) -> Iterator[Violation]:

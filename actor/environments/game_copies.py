@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 
+from daedalus.actor.checking.violations import all_flags
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.protocol.spec import EnvironmentSpec
@@ -138,10 +139,10 @@ class _TurnGame:
             if agent in outcomes:  # the next call passes it on
                 return list(outcomes.values())
             observation, reward, terminated, truncated, info = environment.last()
-            ended = bool(terminated or truncated)
+            ends = _flag(agent, "termination", terminated), _flag(agent, "truncation", truncated)
+            ended = any(ends)
             if agent in self._agents:
-                number = _number(agent, reward)
-                outcomes[agent] = Outcome(agent, observation, number, bool(terminated), bool(truncated), info)
+                outcomes[agent] = Outcome(agent, observation, _number(agent, reward), *ends, info)
                 if not ended:
                     self._turn = agent
                     return list(outcomes.values())
@@ -176,6 +177,13 @@ def _number(agent: str, reward: Any) -> float:
         return float(reward)
     except (TypeError, ValueError):
         raise EnvironmentSetupError(f"{agent} has the reward {described(reward)}: it must be a number") from None
+
+
+def _flag(agent: str, what: str, value: Any) -> bool:
+    if not (isinstance(value, bool) or all_flags(value, 1)):
+        kind = type(value).__name__
+        raise EnvironmentSetupError(f"{agent} has the {what} {described(value)}, of type {kind}: it must be a bool")
+    return bool(value)
 
 
 class _SimultaneousGame:
@@ -272,8 +280,8 @@ class _SimultaneousGame:
                 agent,
                 observations[agent],
                 _number(agent, rewards.get(agent, 0.0)),
-                bool(terminated.get(agent, False)),
-                bool(truncated.get(agent, False)),
+                _flag(agent, "termination", terminated.get(agent, False)),
+                _flag(agent, "truncation", truncated.get(agent, False)),
                 infos.get(agent, {}),
             )
             for agent in agents

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.checking.violations import all_flags, observation_violations
 from daedalus.actor.environments.components import without
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
@@ -226,6 +226,8 @@ class GymnasiumEnvironments:
         try:
             array = np.asarray(values, dtype)
         except (TypeError, ValueError):
+            array = np.zeros(0)
+        if dtype is np.bool_ and not all_flags(values, self.count):  # a text such as "False" would be true
             array = np.zeros(0)
         if array.shape == (self.count,):
             return array

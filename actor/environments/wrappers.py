@@ -1,14 +1,14 @@
 """Wrappers of one gymnasium environment: masks in `info`, repeated actions, one episode for each seed."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from daedalus.actor.checking.violations import observation_violations, reward_violations
+from daedalus.actor.checking.violations import Violation, flag_violations, observation_violations, reward_violations
 from daedalus.actor.environments.components import dtype_misfit, leaves, without
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.info import MASK_KEY
@@ -19,6 +19,7 @@ from daedalus.policy.user_modules import USER_STATE
 Camera = Callable[[np.ndarray, FrameRate], None]
 
 _NUMBERS = (float, int, np.number, np.bool_)
+_FLAGS = (bool, np.bool_)
 _ARRAYS = (gym.Box, gym.Discrete, gym.MultiDiscrete, gym.MultiBinary)
 
 
@@ -56,7 +57,7 @@ class OfItsSpace(gymnasium.Wrapper):
 
     To copy it there, gymnasium converts an integer that is too large for the dtype of the space to another number, and
     its shared memory takes other shapes and fractions, too. A reward that is no number is refused, too: what a batch
-    makes of it depends on environment.processes.
+    makes of it depends on environment.processes. So is an end that is no bool, such as the text "False".
     """
 
     def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str]) -> None:
@@ -84,8 +85,10 @@ class OfItsSpace(gymnasium.Wrapper):
             result = self.env.step(action)
         self._check("step", result[0])
         if not isinstance(result[1], _NUMBERS):
-            for _, text in reward_violations(result[1]):
-                raise EnvironmentSetupError(f"environment {self._name}: {text}")
+            self._raise_problem(reward_violations(result[1]))
+        if not (isinstance(result[2], _FLAGS) and isinstance(result[3], _FLAGS)):
+            self._raise_problem(flag_violations("terminated", result[2]))
+            self._raise_problem(flag_violations("truncated", result[3]))
         return result
 
     def _check(self, call: str, observation: Any) -> None:
@@ -100,9 +103,12 @@ class OfItsSpace(gymnasium.Wrapper):
             if array.dtype == space.dtype and array.shape == space.shape:
                 continue
             if array.size != np.prod(space.shape or (), dtype=np.int64) or dtype_misfit(space, array):
-                for kind, text in observation_violations(self._read_space, observation, call):
-                    if kind == "problem":
-                        raise EnvironmentSetupError(f"environment {self._name}: {text}")
+                self._raise_problem(observation_violations(self._read_space, observation, call))
+
+    def _raise_problem(self, violations: Iterable[Violation]) -> None:
+        for kind, text in violations:
+            if kind == "problem":
+                raise EnvironmentSetupError(f"environment {self._name}: {text}")
 
 
 class RepeatedSteps(gymnasium.Wrapper):

@@ -1,5 +1,6 @@
 """actor/checking: what is found in environments with faults, and in good ones."""
 
+import math
 import re
 from typing import Any, Literal
 
@@ -296,6 +297,21 @@ def test_surplus_parts_of_an_observation_are_a_warning_as_nobody_reads_them() ->
     assert "with the parts ['extra', 'joints'], but observation_space has the parts ['joints']" in text
     found = list(observation_violations(space, {"joints": (3,), "extra": None}, "step"))
     assert [kind for kind, _ in found] == ["warning", "problem"]
+
+
+@pytest.mark.parametrize(
+    ("flag", "kind"),
+    [
+        *[(flag, "problem") for flag in ("False", [True, False], 2, math.nan, {})],
+        *[(flag, "warning") for flag in (0, 1.0, None, np.array([True]))],
+    ],
+    ids=str,
+)
+def test_end_that_is_no_bool(flag: object, kind: str) -> None:
+    result = np.zeros(2, np.float32), 0.0, False, flag, {}
+    ((found, text),) = step_violations(Box(-1, 1, (2,)), result)
+    assert found == kind
+    assert text.endswith("it must be a bool")
 
 
 @pytest.mark.parametrize("reward", [[1.0], "1.0a", None, np.array([1.0, 2.0])], ids=str)

@@ -398,6 +398,8 @@ class Duel(ParallelEnv):
             rewards = {"Red": 1.0, "__all__": 1.0}
         if self.problem == "reward in a list":
             rewards["blue"] = [1.0]
+        if self.problem == "end as text":
+            terminated["blue"] = str(over)
         if self.problem == "all, stays":
             terminated["__all__"] = over
         if self.problem == "late reward":
@@ -671,6 +673,7 @@ def test_a_game_is_checked() -> None:
         ("all, stays", {}, "red has ended, but is still in its `agents`"),
         ("no end", {}, "red has left its `agents` without an end"),
         ("reward in a list", {}, r"blue has the reward \[1.0\]: it must be a number"),
+        ("end as text", {}, "blue has the termination False, of type str: it must be a bool"),
         ("reward", {}, "red has the reward nan: it must be finite"),
         ("raises", {}, "step raises RuntimeError: the table broke"),
     ],

@@ -646,6 +646,14 @@ def test_reward_that_is_no_number_is_refused(processes: bool) -> None:
         _play(processes, kwargs={"fault": "reward in a list"})
 
 
+@pytest.mark.parametrize("processes", [False, True])
+def test_end_that_is_no_bool_is_refused(processes: bool) -> None:
+    reason = "Faulty-v0: step returns terminated=.?False.?, of type str: it must be a bool"
+    with pytest.raises(EnvironmentSetupError, match=reason):
+        _play(processes, kwargs={"fault": "flag as text"})
+    _play(processes, kwargs={"fault": "flag"})  # 0 and 1
+
+
 def test_traceback_of_the_users_code_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(EnvironmentSetupError):
         _play(False, kwargs={"fault": "error in a function"})

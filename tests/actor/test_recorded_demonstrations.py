@@ -11,6 +11,7 @@ import pygame
 import pytest
 from saved_runs import save
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.minari_files import MinariWriter
 from daedalus.actor.evaluation import dataset_recorder
 from daedalus.actor.evaluation.dataset_recorder import Recorder
@@ -119,6 +120,18 @@ def test_an_environment_may_use_its_array_again(tmp_path: Path) -> None:
     Recorder(environment, writer, episodes=1, seed=0).play(Always())
     (episode,) = minari.MinariDataset(tmp_path / "shown/data")
     assert episode.observations.ravel().tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_an_end_that_is_no_bool_is_refused(tmp_path: Path) -> None:
+    class EndsWithText(OneArray):
+        def step(self, action: Any) -> Any:
+            observation, reward, ended, *others = super().step(action)
+            return observation, reward, str(ended), *others
+
+    environment = EndsWithText()
+    writer = MinariWriter(str(tmp_path / "shown"), environment.observation_space, environment.action_space)
+    with pytest.raises(EnvironmentSetupError, match="terminated='False', of type str: it must be a bool"):
+        Recorder(environment, writer, episodes=1, seed=0).play(Always())
 
 
 @pytest.mark.parametrize(("longest", "most_bytes"), [(5, 1 << 30), (100, 72)])  # a step has 4 bytes and 8
