@@ -142,7 +142,7 @@ def all_flags(values: Any, count: int) -> bool:
     """Return whether values are `count` bools, or numbers that are 0 or 1."""
     try:
         array = np.asarray(values)
-    except ValueError:  # lists of different lengths
+    except (TypeError, ValueError):  # such as lists of different lengths, and tensors on a GPU
         return False
     return array.size == count and (
         array.dtype == np.bool_ or (array.dtype.kind in "iuf" and set(array.flat) <= {0, 1})

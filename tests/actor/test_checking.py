@@ -302,7 +302,7 @@ def test_surplus_parts_of_an_observation_are_a_warning_as_nobody_reads_them() ->
 @pytest.mark.parametrize(
     ("flag", "kind"),
     [
-        *[(flag, "problem") for flag in ("False", [True, False], 2, math.nan, {})],
+        *[(flag, "problem") for flag in ("False", [True, False], [[True], [True, False]], 2, math.nan, {})],
         *[(flag, "warning") for flag in (0, 1.0, None, np.array([True]))],
     ],
     ids=str,
