@@ -100,6 +100,16 @@ def training_score(checkpoint: Path) -> float | None:
     return score if math.isfinite(score) else None
 
 
+def newest_return(checkpoint: Path) -> float | None:
+    """Return the mean return of the newest training episodes before a checkpoint; None if there were none."""
+    try:
+        returns = SealedDirectory(checkpoint).content["counters"]["returns"]
+        mean = mean_return(returns) if returns else math.nan
+    except (DamagedError, KeyError, TypeError, ValueError, OverflowError):
+        return None
+    return mean if math.isfinite(mean) else None
+
+
 def _named(run_directory: Path, *, training: bool) -> list[Path]:
     folder = run_directory / "checkpoints"
     entries = folder.iterdir() if folder.is_dir() else ()

@@ -18,7 +18,7 @@ import safetensors.numpy
 from pydantic import Field, TypeAdapter, ValidationError
 
 from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
-from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_in_training, newest_return, training_score
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.releases import remedy, unknown_settings
@@ -97,12 +97,15 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
 def candidates(run_directory: Path) -> list[Path]:
     """Return the checkpoints among which the best is selected after a run. A version may be there twice.
 
-    They are those with the best scores of evaluations and of training episodes, and the newest. Returns an empty list
-    where there is nothing to select: if no checkpoint has a score, or if there was no evaluation and the newest
-    checkpoint was the best in training.
+    They are those with the best scores of evaluations and of training episodes, and the newest. Training episodes have
+    scores while nobody evaluates: where somebody did, only those count that were better than the newest. Returns an
+    empty list where there is nothing to select: if no checkpoint has a score, or if there was no evaluation and the
+    newest checkpoint was the best in training.
     """
     evaluated, trained = best_checkpoints(run_directory), best_in_training(run_directory)
     newest = checkpoints(run_directory)[:1]
+    if evaluated and newest and (reached := newest_return(newest[0])) is not None:
+        trained = [each for each in trained if (score := training_score(each)) is not None and score > reached]
     return [] if not evaluated and trained[:1] in ([], newest) else [*evaluated, *trained, *newest]
 
 

@@ -256,6 +256,16 @@ def test_the_good_weights_of_a_run_that_collapses_without_evaluator_are_kept(run
     assert find_policy(run.directory).policy_version == 12
 
 
+def test_what_was_worse_in_training_before_the_first_evaluation_is_no_candidate(run: Run) -> None:
+    assert collapse(run, -5.0, 0.0) == ["0000000002", "0000000001"]
+    keep_if_best(checkpoints(run.directory)[1], -7.0, 1)
+    run.state.evaluations.heard = module.time.monotonic()
+    collapse(run, -1.0)
+    assert [each.policy_version for each in read_candidates(run.directory)] == [1, 2, 3], "0 is more than -1"
+    collapse(run, 14.0)
+    assert [each.policy_version for each in read_candidates(run.directory)] == [1, 4]
+
+
 @pytest.mark.parametrize(
     ("settings", "other"),
     [({"training_kwargs": {"bonus": 1.0}}, True), ({"no_reward_limit": 9}, True), ({"training_kwargs": {}}, False)],
