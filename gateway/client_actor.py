@@ -119,8 +119,8 @@ class ClientActor:
         played = None if message.override is None else self.spaces.checked_action(message.override)
         self._check_reward(message.reward)
         begins = self._begins(current)
-        rows = self._new_rows(current) if begins else self.rows
         try:
+            rows = self._new_rows(current, message.reward) if begins else self.rows
             rows.observe(values, mask, 0.0 if begins else message.reward)
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
@@ -146,8 +146,11 @@ class ClientActor:
         if value and (self._rows is None or not self._rows.in_episode):
             raise ClientError("out_of_turn", "a reward came before any action of the episode: send an act first")
 
-    def _new_rows(self, current: PolicyVersion) -> ClientRows:
-        """Return rows for the learner epoch of a policy. Raises ClientError if it cannot explore as the client must."""
+    def _new_rows(self, current: PolicyVersion, reward: float = 0.0) -> ClientRows:
+        """Return rows for the learner epoch of a policy, after a reward of the last action.
+
+        Raises ClientError if it cannot explore as the client must.
+        """
         assert self._transforms is not None
         assert self._session is not None
         try:
@@ -164,7 +167,7 @@ class ClientActor:
         except PolicyError as error:
             raise ClientError("refused", str(error)) from None
         if self._rows is not None:
-            rows.take_over(self._rows)
+            rows.take_over(self._rows, reward)
         return rows
 
     @property

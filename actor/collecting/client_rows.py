@@ -104,8 +104,14 @@ class ClientRows:
             self._drawn = self.draws.draw()
         return self._drawn
 
-    def take_over(self, rows: "ClientRows") -> None:
-        """Go on with the parameters of rows under another learner: of their running episode, or of the next."""
+    def take_over(self, rows: "ClientRows", reward: float = 0.0) -> None:
+        """Go on with the running episode of rows under another learner, its return and its parameters, or with the
+        parameters of the next.
+
+        `reward` is added to that of its last action. Raises ValueError for one that `reward` would refuse.
+        """
+        if rows.in_episode:
+            self._writer.go_on(rows._writer, np.array([rows._with(reward)]))
         known = rows._playing if rows.in_episode else rows._drawn
         if self.draws is not None and known is not None and known.keys() == self.draws.true_task.keys():
             self._drawn = known
@@ -219,10 +225,14 @@ class ClientRows:
         """
         if not self._acted:
             raise ValueError("a reward came before any action of this episode: call act() first")
+        self._reward = self._with(value)
+
+    def _with(self, value: float) -> float:
+        """Return the reward of the last action with another one. Raises ValueError if rollouts cannot have it."""
         total = self._reward + float(value)
         if not abs(total) <= _LARGEST_REWARD:  # false for NaN too
             raise ValueError(f"the reward is {total}: it must be finite, and a number of 32 bits holds it")
-        self._reward = total
+        return total
 
     def end_episode(self, observation: Any, *, terminated: bool, reward: float = 0.0) -> None:
         """End the episode with the last action; `observation` is the one that it led to, or None if unknown.

@@ -87,6 +87,10 @@ class EpisodeCounter:
         self.restart()
         self.ended[:] = True
 
+    def go_on(self, before: "EpisodeCounter", rewards: np.ndarray) -> None:
+        """Go on with the running episodes of another counter, after one more row of theirs with these rewards [E]."""
+        self._returns, self._lengths = before._returns + rewards, before._lengths + 1
+
     def restart(self) -> None:
         """Forget the running episodes: others begin."""
         self._returns[:] = 0.0
@@ -214,6 +218,10 @@ class RolloutWriter:
         """Begin with the first observations of all environments."""
         self._stacks.push(observed.frames, np.ones(self._count, np.bool_))
         self._current_masks = observed.masks
+
+    def go_on(self, before: "RolloutWriter", rewards: np.ndarray) -> None:
+        """Count the episodes of another writer on, whose last row, with these rewards [E], it has not recorded."""
+        self._episodes.go_on(before._episodes, rewards)
 
     def act(self) -> dict[str, np.ndarray]:
         """Return the actions {name: [E, D]} that the policy chooses for the next row."""

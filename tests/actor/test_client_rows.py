@@ -173,6 +173,25 @@ def test_end_of_an_episode_with_a_wrong_reward_has_changed_nothing() -> None:
     assert rollout.frames["observation"][2, 0].tolist() == [1, 1]
 
 
+def test_an_episode_goes_on_under_another_learner_with_its_return() -> None:
+    loop = Loop()
+    for _ in range(3):
+        loop.act()
+    before, loop.rows = loop.rows, rows_of(TRANSFORMS, RUNTIME, loop.rollouts)
+    with pytest.raises(ValueError, match="it must be finite"):
+        loop.rows.take_over(before, 1e39)
+    loop.rows.take_over(before, 0.25)
+    for terminated in (True, False):
+        loop.act()
+        loop.end(terminated=terminated)
+    loop.act()
+    loop.observe()
+    (rollout,) = loop.rollouts
+    assert rollout.episode_lengths.tolist() == [4, 1]
+    np.testing.assert_allclose(rollout.episode_returns, [1.0 + 1.01 + 1.02 + 0.25 + 1.03, 2.0])
+    assert rollout.rewards[0, 0] == np.float32(1.03), "the rows before are of the other learner"
+
+
 def test_memory_begins_anew_after_an_interruption() -> None:
     loop = Loop()
     for _ in range(ROWS + 1):  # the first row of the second rollout has begun

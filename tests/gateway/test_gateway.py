@@ -329,11 +329,20 @@ def test_clients_join_the_learner_that_returns(
     returned.publish(5)
     try:
         until(lambda: "arm-1" in [join.actor for join in list(returned.joins.queue)])
+        filled = 0
         while returned.rollouts.empty():
             fill_rollout(client, 10.0)
-        rollout, _ = returned.receive()
+            filled += 1
+        rollout, request = returned.receive()
         assert (rollout.identity.learner_epoch, rollout.identity.sequence) == (2, 0)
         assert rollout.policy_version == 5
+        client.send("end_episode", terminated=True)
+        while not len(rollout.episode_lengths):
+            acknowledge(request, "accepted", version=5)
+            fill_rollout(client)
+            rollout, request = returned.receive()
+        assert rollout.episode_lengths[0] == 2 + (ROWS + 1) * filled, "also what it played for the learner before"
+        assert rollout.episode_returns[0] == ROWS * filled
     finally:
         returned.transport.close()
 
