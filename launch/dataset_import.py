@@ -43,10 +43,8 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
     Raises SettingsError, in one line, if the dataset cannot be read or does not fit the run, or nothing would learn
     from it. Then nothing is written.
     """
-    if not spec.algorithm.demonstrations:
-        raise SettingsError(f"{spec.training.algorithm} does not learn from demonstrations: choose appo or sac")
-    if spec.environment.is_game:
-        raise SettingsError("demonstrations are of one agent, and this environment has several")
+    if reason := _unlearned(spec):
+        raise SettingsError(reason)
     try:
         with MinariReader(name, spec.environment.leave_out) as dataset:
             transforms = Transforms(spec.environment, dataset.observation_space, dataset.action_space)
@@ -72,6 +70,28 @@ def write_demonstrations(name: str, spec: RunSpec, spaces: Spaces | None, direct
         raise SettingsError(str(error)) from None
     except OSError as error:
         raise SettingsError(f"demonstrations cannot be written to {directory}: {error.strerror}") from None
+
+
+def _unlearned(spec: RunSpec) -> str:
+    """Return why the run would learn from no demonstrations, or an empty string."""
+    training = spec.training
+    if not spec.algorithm.demonstrations:
+        return f"{training.algorithm} does not learn from demonstrations: choose appo or sac"
+    if spec.environment.is_game:
+        return "demonstrations are of one agent, and this environment has several"
+    if spec.algorithm.replay:
+        share, rows = training.demonstration_share, training.minibatch_rows
+        if not round(share * rows):
+            return (
+                f"training.demonstration_share is {share:g} of the {rows} rows of a minibatch, and none is a "
+                "demonstration: raise it, or leave --demonstrations out"
+            )
+    elif not (training.cloning_updates or training.cloning_weight):
+        return (
+            "training.cloning_updates and training.cloning_weight are 0, and nothing is learned from demonstrations: "
+            "raise one of them, or leave --demonstrations out"
+        )
+    return ""
 
 
 def _check_first_choices(name: str, transforms: Transforms, spec: RunSpec) -> None:

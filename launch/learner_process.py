@@ -190,7 +190,10 @@ def choose_run(options: LearnerOptions) -> ChosenRun:
     modules.check(spec.learner_modules)  # the learner makes no environment
     spec = with_record(spec, modules)
     if options.prepared is None:  # else the program that prepared the run has said it
-        warn_of_unread(new.choice.names(), spec)
+        has_demonstrations = new.demonstrations is not None or (
+            directory is not None and (directory / run_directory.DEMONSTRATIONS).is_dir()
+        )
+        warn_of_unread(new.choice.names(), spec, demonstrations=has_demonstrations)
     exists = (directory / run_directory.CONFIG).exists()
     return ChosenRun(spec=spec, directory=options.here / directory, exists=exists, changed=changed, modules=modules)
 

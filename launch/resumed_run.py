@@ -60,7 +60,8 @@ class ResumeChoice:
         with Surroundings():  # which an algorithm of the user may change when it is imported
             changed = with_record(with_changes(spec, self.assignments, self.directory, settings), modules)
         chosen = RunChoice(assignments=self.assignments, settings=settings).assigned
-        warn_of_unread(chosen, changed, only_at_the_start(self.directory))
+        shown = (self.directory / run_directory.DEMONSTRATIONS).is_dir()
+        warn_of_unread(chosen, changed, only_at_the_start(self.directory), demonstrations=shown)
         return changed
 
 

@@ -234,7 +234,7 @@ def create_run(new: NewRun, *, started: float, fork: bool = False) -> tuple[RunL
         run_directory.check_free(new.directory)  # before the environment is made
     check_initial(new.init_from, other_spaces=new.other_spaces)
     with Surroundings():  # which an algorithm of the user may change when it is imported
-        spec, spaces = _prepared(new.choice, fork)
+        spec, spaces = _prepared(new, fork)
     lock, spec = new.create(spec, new.directory or new.choice.directory(spec), spaces)
     return lock, LocalRun(
         directory=lock.directory,
@@ -246,8 +246,8 @@ def create_run(new: NewRun, *, started: float, fork: bool = False) -> tuple[RunL
     )
 
 
-def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
-    spec = choice.spec()
+def _prepared(new: NewRun, fork: bool) -> tuple[RunSpec, Spaces | None]:
+    choice, spec = new.choice, new.choice.spec()
     if choice.env is None:
         spaces = checked_spaces(spec, fork=fork)
     else:
@@ -257,12 +257,26 @@ def _prepared(choice: RunChoice, fork: bool) -> tuple[RunSpec, Spaces | None]:
     if problem := unmeasured_target(spec):
         raise SettingsError(problem)
     # A file may be the config.toml of another run, with the default settings of its environment.
-    warn_of_unread(choice.names(), spec, unread_settings(spec, spaces) & choice.assigned)
+    unread = unread_settings(spec, spaces) & choice.assigned
+    warn_of_unread(choice.names(), spec, unread, demonstrations=new.demonstrations is not None)
     return with_record(spec, UserModules.of(spec.user_modules)), spaces
 
 
-def warn_of_unread(chosen: set[str], spec: RunSpec, too: AbstractSet[str] = frozenset()) -> None:
-    """Log which settings that a user chose have no effect in the run; `too` are further ones that nothing reads."""
+_OF_DEMONSTRATIONS = {"training.cloning_updates", "training.cloning_weight"}
+
+
+def warn_of_unread(
+    chosen: set[str], spec: RunSpec, too: AbstractSet[str] = frozenset(), *, demonstrations: bool = True
+) -> None:
+    """Log which settings that a user chose have no effect in the run.
+
+    Args:
+      chosen: by the user.
+      spec: of the run.
+      too: further settings that nothing reads.
+      demonstrations: whether the run has any.
+    """
+    too = too if demonstrations else too | _OF_DEMONSTRATIONS
     if unread := sorted(chosen & (unread_settings(spec) | too)):
         _logger.warning("no effect in this run (algorithm %s): %s", spec.training.algorithm, ", ".join(unread))
 

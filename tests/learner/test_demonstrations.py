@@ -318,6 +318,12 @@ def test_a_dataset_that_does_not_fit_the_run_or_the_memory_is_refused(
         write_demonstrations("arm/shown-v0", spec_of(), spaces_of(3), tmp_path)
     with pytest.raises(SettingsError, match="impala does not learn from demonstrations"):
         write_demonstrations("arm/shown-v0", RunSpec.model_validate({"environment": {"id": "A-v0"}}), None, tmp_path)
+    for unlearned in (
+        {"demonstration_share": 0.04},  # of 10 rows, none
+        {"algorithm": "appo", "cloning_updates": 0, "cloning_weight": 0.0},
+    ):
+        with pytest.raises(SettingsError, match="leave --demonstrations out"):
+            write_demonstrations("arm/shown-v0", spec_of(**unlearned), None, tmp_path)
     with pytest.raises(SettingsError, match="nowhere is no Minari dataset"):
         write_demonstrations("nowhere", spec_of(), None, tmp_path)
     with caplog.at_level(logging.WARNING):

@@ -531,6 +531,13 @@ def test_settings_of_the_user_that_nothing_reads_are_named(tmp_path: Path, caplo
     assert caplog.messages == [f"{start}clip_range, training.passes", f"{start}clip_range"]
 
 
+def test_settings_of_demonstrations_that_a_run_has_not_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    choice = RunChoice(env="CartPole-v1", algorithm="appo", assignments=["training.cloning_weight=0.2"])
+    for demonstrations in (True, False):
+        warn_of_unread(choice.names(), choice.spec(), demonstrations=demonstrations)
+    assert caplog.messages == ["no effect in this run (algorithm appo): training.cloning_weight"]
+
+
 @pytest.mark.parametrize("table", [3, {"impala": 3}, {"impala": {"training": 3}}])
 def test_for_algorithm_that_is_not_a_table_of_sections_is_refused(table: object) -> None:
     with pytest.raises(SettingsError, match="for_algorithm"):
