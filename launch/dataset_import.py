@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from pydantic import JsonValue
 
 from daedalus.actor.collecting.rollout_writer import make_learnable
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
@@ -23,7 +24,7 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import LARGEST_REWARD, DiscreteSpace, Spaces, unfit_number
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
-from daedalus.protocol.texts import listed
+from daedalus.protocol.texts import bounded_text, listed
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _logger = logging.getLogger(__name__)
@@ -122,12 +123,27 @@ def _warn(dataset: MinariReader, environment: EnvironmentSpec) -> None:
         _logger.warning(
             "dataset %s was recorded in %s, and the run plays %s", dataset.name, dataset.environment, environment.id
         )
+    elif others := _other_arguments(dataset, environment):
+        _logger.warning(
+            "dataset %s was recorded without the arguments %s, which the environment of the run has: its rewards, and "
+            "what follows an action, may be others",
+            dataset.name,
+            bounded_text(", ".join(f"{name}={value!r}" for name, value in others.items()), 200),
+        )
     if dataset.has_images_as_jpeg:
         _logger.warning(
             "dataset %s has images as JPEG, which are not quite those that the policy will see: Minari writes exact "
             "ones with jpeg_encoding=False",
             dataset.name,
         )
+
+
+def _other_arguments(dataset: MinariReader, environment: EnvironmentSpec) -> dict[str, JsonValue]:
+    """Return the arguments of the run's environment that the one of a dataset had not, if that is known."""
+    there, here = dataset.environment_kwargs, environment.constructor_kwargs
+    if not isinstance(there, dict):
+        return {}
+    return {name: value for name, value in here.items() if name != "render_mode" and there.get(name, ...) != value}
 
 
 def _rollouts(dataset: MinariReader, transforms: Transforms, spec: RunSpec) -> Iterator[Rollout]:

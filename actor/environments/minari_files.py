@@ -118,7 +118,9 @@ class MinariReader:
             )
         _import_minari()
         content = self._metadata(data / "metadata.json")
-        self.environment = _environment_id(content.get("env_spec"))
+        made_from = _env_spec(content.get("env_spec"))
+        self.environment = bounded_text(str(made_from.get("id", "")), 200)  # empty if it is unknown
+        self.environment_kwargs = made_from.get("kwargs")  # arguments of its constructor; any JSON
         self.observation_space = without(self._space(content, "observation_space"), leave_out)
         self.action_space = self._space(content, "action_space")
         self._has_jpegs = content.get("jpeg_encoding", True) is not False
@@ -345,12 +347,13 @@ def _check_space(described: Any) -> None:
         _check_space(part)
 
 
-def _environment_id(env_spec: Any) -> str:
-    """Return the id in the specification of an environment, as text; empty without any."""
+def _env_spec(text: Any) -> dict[str, Any]:
+    """Return the specification of an environment; empty without any."""
     try:
-        return bounded_text(str(json.loads(env_spec).get("id", "")), 200)
-    except (TypeError, ValueError, AttributeError, RecursionError):
-        return ""
+        found = json.loads(text)
+    except (TypeError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 class MinariWriter:

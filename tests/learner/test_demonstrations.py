@@ -15,6 +15,7 @@ import h5py
 import minari
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from mission_environment import MissionSpace
@@ -318,10 +319,8 @@ def test_a_dataset_that_does_not_fit_the_run_or_the_memory_is_refused(
         write_demonstrations("arm/shown-v0", spec_of(), spaces_of(3), tmp_path)
     with pytest.raises(SettingsError, match="impala does not learn from demonstrations"):
         write_demonstrations("arm/shown-v0", RunSpec.model_validate({"environment": {"id": "A-v0"}}), None, tmp_path)
-    for unlearned in (
-        {"demonstration_share": 0.04},  # of 10 rows, none
-        {"algorithm": "appo", "cloning_updates": 0, "cloning_weight": 0.0},
-    ):
+    of_sac: dict[str, Any] = {"demonstration_share": 0.04}  # of 10 rows, none
+    for unlearned in (of_sac, {"algorithm": "appo", "cloning_updates": 0, "cloning_weight": 0.0}):
         with pytest.raises(SettingsError, match="leave --demonstrations out"):
             write_demonstrations("arm/shown-v0", spec_of(**unlearned), None, tmp_path)
     with pytest.raises(SettingsError, match="nowhere is no Minari dataset"):
@@ -438,6 +437,27 @@ def test_a_hostile_image_is_refused(tmp_path: Path, change: Any, reason: str) ->
         pytest.raises(DatasetError, match=f"image 2 .* cannot be read: .*{reason}"),
     ):
         list(dataset)
+
+
+def test_a_dataset_without_the_arguments_of_the_environment_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    made_from = EnvSpec("Arm-v0", "arm:Arm", kwargs={"speed": 2, "sparse": False})
+    MinariWriter(str(tmp_path / "shown"), OBSERVATIONS, ACTIONS, made_from).add(EPISODES[0])
+    for number, changed in enumerate(
+        ({"kwargs": {"speed": 2.0}}, {"kwargs": {"speed": 2}, "training_kwargs": {"sparse": True, "size": [1, 2]}})
+    ):
+        environment = {"id": "arm:Arm-v0", **changed}
+        directory = tmp_path / str(number)
+        directory.mkdir()
+        write_demonstrations(
+            str(tmp_path / "shown"),
+            spec_of().model_copy(update={"environment": EnvironmentSpec.model_validate(environment)}),
+            None,
+            directory,
+        )
+    (warning,) = [text for text in caplog.messages if "was recorded" in text]
+    assert "recorded without the arguments sparse=True, size=[1, 2], which the environment of the run has" in warning
 
 
 def jpeg(size: tuple[int, int], mode: str = "RGB", form: str = "jpeg") -> bytes:
