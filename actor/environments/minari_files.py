@@ -398,8 +398,10 @@ class MinariWriter:
                 serialize_space(written)
             except NotImplementedError as error:
                 reason = str(error)
-            if len(leaves(space, "value")) != len(leaves(written, "value")):
-                reason = "two keys differ only by a slash: rename one"
+            # Also the order of keys is that of the written ones, which numbers the components with like names.
+            names = {tuple(map(_written_key, leaf.path)): leaf.name for leaf in leaves(space, "value")}
+            if names != {leaf.path: leaf.name for leaf in leaves(written, "value")}:
+                reason = "two keys differ only by a slash, or by characters that no component's name has: rename one"
         if reason:
             raise DatasetError(bounded_text(f"dataset {self._name} cannot be written: {reason}", 500))
 

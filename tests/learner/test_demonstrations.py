@@ -180,6 +180,13 @@ def test_texts_and_keys_with_slashes_are_recorded(tmp_path: Path) -> None:
     assert [*theirs[0].observations["mission"]] == ["go on", "on"]
 
 
+@pytest.mark.parametrize("keys", [("arm/z", "arm_z"), ("arm/z", "arm:z")])
+def test_keys_whose_components_would_change_places_are_not_recorded(tmp_path: Path, keys: tuple[str, str]) -> None:
+    space = gymnasium.spaces.Dict(dict.fromkeys(keys, OBSERVATIONS))
+    with pytest.raises(DatasetError, match="two keys differ only by a slash, or by"):
+        MinariWriter(str(tmp_path / "shown"), space, ACTIONS)
+
+
 @pytest.mark.parametrize(
     ("space", "observations", "reward", "reason"),
     [
