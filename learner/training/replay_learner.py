@@ -107,10 +107,10 @@ class ReplayLearner(Learner):
         """
         self.far_outside = {}
         if rollouts:
-            steps = sum(rollout.agent_steps for rollout in rollouts)
-            if self.replay.rows_added + steps >= self._begin:
+            before = self.replay.rows_added
+            steps = sum(rollout.agent_steps for rollout in self._receive(rollouts))
+            if before + steps >= self._begin:
                 self._owed += self._spec.updates_per_env_step * steps
-            self._receive(rollouts)
         end = time.monotonic() + _SLICE_SECONDS
         while self.updates_due and time.monotonic() < end:
             self._owed -= 1.0
@@ -118,13 +118,15 @@ class ReplayLearner(Learner):
                 self._update(progress)
         return []
 
-    def _receive(self, rollouts: Sequence[Rollout]) -> None:
+    def _receive(self, rollouts: Sequence[Rollout]) -> list[Rollout]:
+        """Add rollouts to the buffer, and return those that were not left out."""
         batch, kept, seen = self._sorted_out(rollouts)
         for rollout in kept:
             # With the rewards as they came: what a few short rollouts confirm would keep rare rewards small for ever.
             self.replay.add(rollout)
         self._merge_observations([seen[rollout] for rollout in kept])
         self.metrics.add_batch(batch)
+        return kept
 
     def _fitting_minibatch(self) -> int:
         """Return the number of rows of a minibatch, by halves of it, whose gradients fit into the device's memory."""

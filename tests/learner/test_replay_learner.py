@@ -96,6 +96,26 @@ def test_buffer_has_room_for_all_env_steps_of_a_run_beside_its_reset_rows_or_as_
     assert [each.updates_of([rollout(9)]) for each in learners] == [8, 8]  # half of the budget is enough to begin
 
 
+def test_a_rollout_that_is_left_out_earns_no_updates() -> None:
+    ours, theirs = (ReplayLearner(spec_of(updates_per_env_step=0.125), SPACES) for _ in range(2))
+
+    def learn(learner: ReplayLearner, rollouts: list[Rollout]) -> int:
+        learner.step(rollouts, 0.0)
+        while learner.updates_due:
+            learner.step([], 0.0)
+        return learner.policy_version
+
+    def of_actors(batch: int) -> list[Rollout]:
+        return [replace(rollout(batch), identity=identity(name, batch)) for name in "abz"]
+
+    for batch in range(3):
+        assert learn(ours, of_actors(batch)) == learn(theirs, of_actors(batch))
+    first, second, third = of_actors(3)
+    bad = replace(third, rewards=np.full_like(third.rewards, 1e9))
+    assert learn(ours, [first, second, bad]) == learn(theirs, [first, second])
+    assert len(ours.replay) == len(theirs.replay)
+
+
 def test_updates_change_policy_critics_and_temperature() -> None:
     learner = trained(ReplayLearner(spec_of(), SPACES), 0)
     before = {name: values.copy() for name, values in learner.weights().items()}
