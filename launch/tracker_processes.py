@@ -32,7 +32,7 @@ from daedalus.learner.run.run_directory import run_name
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModuleError
 
-_END_SECONDS = 60.0  # after the end of the run; a parent that lives ends this process before
+_END_SECONDS = 150.0  # after the end of the run; a parent that lives ends this process before
 
 
 def main() -> int:
@@ -67,7 +67,7 @@ def _end_in_time(finish: threading.Event) -> None:
     os._exit(1)
 
 
-_FINISH_SECONDS = 30.0  # to upload what is left at the end of the run
+_FINISH_SECONDS = 120.0  # to start on a busy machine, and to upload what is left at the end of the run
 _STOP_SECONDS = 2.5  # the same after Ctrl-C
 _QUIET_SECONDS = 2.0  # of waiting, before the user is informed
 _POLL_SECONDS = 0.05
