@@ -393,7 +393,7 @@ class Duel(ParallelEnv):
             agent: float(actions[agent]) if self.problem != "reward" else np.nan for agent in here
         }
         self.agents = here if not over or self.problem.endswith("stays") else []
-        terminated = dict.fromkeys(here, over and self.problem not in ("no end", "all, stays"))
+        terminated: dict[str, Any] = dict.fromkeys(here, over and self.problem not in ("no end", "all, stays"))
         if self.problem == "other agent":
             rewards = {"Red": 1.0, "__all__": 1.0}
         if self.problem == "reward in a list":
