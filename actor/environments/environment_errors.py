@@ -106,6 +106,13 @@ def import_extra(module: str, extra: str, purpose: str, otherwise: str = "") -> 
         ) from None
 
 
+def raise_problem(whose: str, violations: Iterable[tuple[str, str]]) -> None:
+    """Raise EnvironmentSetupError for the first problem among violations (actor/checking/violations.py), if any."""
+    for kind, text in violations:
+        if kind == "problem":
+            raise EnvironmentSetupError(f"{whose}: {text}")
+
+
 def hint_of_count(made: int, count: int) -> str:
     """Return what may be wrong where an environment cannot be made, but `made` others of `count` could."""
     if not made:

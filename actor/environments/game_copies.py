@@ -5,8 +5,8 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 
-from daedalus.actor.checking.violations import all_flags
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
+from daedalus.actor.checking.violations import flag_violations
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, raise_problem
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.texts import listed
@@ -139,7 +139,7 @@ class _TurnGame:
             if agent in outcomes:  # the next call passes it on
                 return list(outcomes.values())
             observation, reward, terminated, truncated, info = environment.last()
-            ends = _flag(agent, "termination", terminated), _flag(agent, "truncation", truncated)
+            ends = _flag(agent, "terminated", terminated), _flag(agent, "truncated", truncated)
             ended = any(ends)
             if agent in self._agents:
                 outcomes[agent] = Outcome(agent, observation, _number(agent, reward), *ends, info)
@@ -179,11 +179,10 @@ def _number(agent: str, reward: Any) -> float:
         raise EnvironmentSetupError(f"{agent} has the reward {described(reward)}: it must be a number") from None
 
 
-def _flag(agent: str, what: str, value: Any) -> bool:
-    if not (isinstance(value, bool) or all_flags(value, 1)):
-        kind = type(value).__name__
-        raise EnvironmentSetupError(f"{agent} has the {what} {described(value)}, of type {kind}: it must be a bool")
-    return bool(value)
+def _flag(agent: str, name: str, flag: Any) -> bool:
+    if not isinstance(flag, bool):
+        raise_problem(agent, flag_violations(name, flag))
+    return bool(flag)
 
 
 class _SimultaneousGame:
@@ -280,8 +279,8 @@ class _SimultaneousGame:
                 agent,
                 observations[agent],
                 _number(agent, rewards.get(agent, 0.0)),
-                _flag(agent, "termination", terminated.get(agent, False)),
-                _flag(agent, "truncation", truncated.get(agent, False)),
+                _flag(agent, "terminated", terminated.get(agent, False)),
+                _flag(agent, "truncated", truncated.get(agent, False)),
                 infos.get(agent, {}),
             )
             for agent in agents

@@ -1,16 +1,16 @@
 """Wrappers of one gymnasium environment: masks in `info`, repeated actions, one episode for each seed."""
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from daedalus.actor.checking.violations import Violation, flag_violations, observation_violations, reward_violations
+from daedalus.actor.checking.violations import flag_violations, observation_violations, reward_violations
 from daedalus.actor.environments.components import dtype_misfit, leaves, without
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, raise_problem
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.rendering import CountedSteps, FrameRate, frame_rate
 from daedalus.policy.user_code import first_line, place_of
@@ -63,7 +63,7 @@ class OfItsSpace(gymnasium.Wrapper):
     def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str]) -> None:
         """Construct from the environment, its id, and the names of components that nobody reads."""
         super().__init__(environment)
-        self._name = name
+        self._whose = f"environment {name}"
         self._read_space = without(environment.observation_space, left_out)
         self._leaves = [leaf for leaf in leaves(self._read_space, "observation") if isinstance(leaf.space, _ARRAYS)]
         only = self._read_space
@@ -85,10 +85,10 @@ class OfItsSpace(gymnasium.Wrapper):
             result = self.env.step(action)
         self._check("step", result[0])
         if not isinstance(result[1], _NUMBERS):
-            self._raise_problem(reward_violations(result[1]))
+            raise_problem(self._whose, reward_violations(result[1]))
         if not (isinstance(result[2], _FLAGS) and isinstance(result[3], _FLAGS)):
-            self._raise_problem(flag_violations("terminated", result[2]))
-            self._raise_problem(flag_violations("truncated", result[3]))
+            raise_problem(self._whose, flag_violations("terminated", result[2]))
+            raise_problem(self._whose, flag_violations("truncated", result[3]))
         return result
 
     def _check(self, call: str, observation: Any) -> None:
@@ -103,12 +103,7 @@ class OfItsSpace(gymnasium.Wrapper):
             if array.dtype == space.dtype and array.shape == space.shape:
                 continue
             if array.size != np.prod(space.shape or (), dtype=np.int64) or dtype_misfit(space, array):
-                self._raise_problem(observation_violations(self._read_space, observation, call))
-
-    def _raise_problem(self, violations: Iterable[Violation]) -> None:
-        for kind, text in violations:
-            if kind == "problem":
-                raise EnvironmentSetupError(f"environment {self._name}: {text}")
+                raise_problem(self._whose, observation_violations(self._read_space, observation, call))
 
 
 class RepeatedSteps(gymnasium.Wrapper):

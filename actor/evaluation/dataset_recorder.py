@@ -14,7 +14,12 @@ import numpy as np
 from daedalus.actor.checking.violations import flag_violations
 from daedalus.actor.environments.bots import make_bot
 from daedalus.actor.environments.components import leaves, stacked
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors, playing_error
+from daedalus.actor.environments.environment_errors import (
+    EnvironmentSetupError,
+    creation_errors,
+    playing_error,
+    raise_problem,
+)
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium
 from daedalus.actor.environments.info import MASK_KEY
 from daedalus.actor.environments.minari_files import EPISODE_BYTES, Episode, MinariWriter
@@ -137,9 +142,8 @@ class Recorder(gymnasium.Wrapper):
             observation, reward, terminated, truncated, info = self.env.step(action)
             self._observations.append(copy.deepcopy(observation))
             self._rewards.append(float(reward))
-            for kind, text in (*flag_violations("terminated", terminated), *flag_violations("truncated", truncated)):
-                if kind == "problem":
-                    raise EnvironmentSetupError(f"environment {self._name}: {text}")
+            raise_problem(f"environment {self._name}", flag_violations("terminated", terminated))
+            raise_problem(f"environment {self._name}", flag_violations("truncated", truncated))
             truncated = truncated or (not terminated and self._is_too_long(observation, action))
         if terminated or truncated:
             with self._faults("step"):  # such as observations of different shapes

@@ -673,7 +673,7 @@ def test_a_game_is_checked() -> None:
         ("all, stays", {}, "red has ended, but is still in its `agents`"),
         ("no end", {}, "red has left its `agents` without an end"),
         ("reward in a list", {}, r"blue has the reward \[1.0\]: it must be a number"),
-        ("end as text", {}, "blue has the termination False, of type str: it must be a bool"),
+        ("end as text", {}, "blue: step returns terminated='False', of type str: it must be a bool"),
         ("reward", {}, "red has the reward nan: it must be finite"),
         ("raises", {}, "step raises RuntimeError: the table broke"),
     ],
